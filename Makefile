@@ -1,0 +1,40 @@
+# Every command builds .venv first, once, and again when pyproject.toml or the plugin's source changes.
+
+PYTHON ?= python3.11
+VENV := .venv
+BIN := $(VENV)/bin
+STAMP := $(VENV)/installed
+ROOMS := storage workers learner service
+
+export OMP_NUM_THREADS = 1
+export OPENBLAS_NUM_THREADS = 1
+export MKL_NUM_THREADS = 1
+
+.PHONY: install train test check bench clean
+
+install: $(STAMP)
+
+$(STAMP): pyproject.toml $(wildcard workers/native/*.c)
+	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
+	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
+	touch $(STAMP)
+
+train: install
+	$(BIN)/t6gps train flat-quick
+
+test: install
+	$(BIN)/pytest
+
+check: install
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+	$(BIN)/lint-imports
+	@mkdir -p build/typing/t6gps && for room in $(ROOMS) deploy; do ln -sfn ../../../$$room build/typing/t6gps/$$room; done
+	cd build/typing && MYPYPATH=. ../../$(BIN)/mypy --config-file ../../pyproject.toml --namespace-packages \
+		--explicit-package-bases $(ROOMS:%=t6gps/%)
+
+bench: install
+	$(BIN)/t6gps bench physics
+
+clean:
+	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

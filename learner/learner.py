@@ -1,0 +1,286 @@
+"""One iteration of T6-GPS after sampling (paper Algorithm 2, lines 3 to 13), the only stateful part of the learner.
+
+learner.add(frames)                     once per episode, in any order
+for done, total in learner.segment():   ...         each phase reports its progress while it runs
+for done, total in learner.fit():       ...
+for done, total in learner.backward_pass(): ...
+for done, total in learner.supervise(): ...         learner.snapshot is now the next policy version
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, TypeVar
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+from t6gps.learner import cost, lqg, policy, supervised, surrogate, warping
+from t6gps.learner.features import NONE, Rows, read_rows
+from t6gps.learner.modes import FitOptions
+from t6gps.learner.segments import SegmentGroup, Segments, cut, group
+from t6gps.learner.settings import LearnerSettings
+from t6gps.storage import schema
+from t6gps.storage.errors import CheckpointError, DataError, RunError
+from t6gps.storage.records import PolicySnapshot
+
+FitMap = Callable[
+    [Callable[[surrogate.ClassJob], surrogate.ClassModel], Sequence[surrogate.ClassJob]],
+    Iterator[surrogate.ClassModel],
+]
+Pairs = tuple[NDArray[np.float32], NDArray[np.float32]]
+Phase = TypeVar("Phase")
+
+LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM = 1, 1, 2
+"""Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy)."""
+CHUNK = 256
+"""Sub-trajectories solved at once: their matrices stay in the cache."""
+
+
+@dataclass(frozen=True)
+class _Segmented:
+    rows: Rows
+    segments: Segments
+    groups: list[SegmentGroup]
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    fits: dict[int, surrogate.ClassModel]
+    patch: surrogate.Patch
+
+
+@dataclass(frozen=True)
+class _Improved:
+    pairs: Pairs
+    report: dict[str, Any]
+
+
+class Learner:
+    """Turns the episodes of one iteration into the next policy.
+
+    run_seed               root of all randomness here, with the iteration, which is the policy's version
+    target_speed_m_per_s   v* of the cost
+    vertical_weight        weight of the vertical velocity in the cost
+    command_range_m        improved actions are clipped to it
+    offset_m, scale_m      u = offset + scale * network
+    fit_map                applies a pure function to jobs and returns the results in their order; `map` or a
+                           pool
+    """
+
+    def __init__(
+        self,
+        settings: LearnerSettings,
+        *,
+        run_seed: int,
+        target_speed_m_per_s: float,
+        vertical_weight: float,
+        command_range_m: tuple[float, float],
+        offset_m: float,
+        scale_m: float,
+        fit_map: FitMap = map,
+    ) -> None:
+        self._settings = settings
+        self._run_seed = run_seed
+        self._target_speed_m_per_s = target_speed_m_per_s
+        self._vertical_weight = vertical_weight
+        self._command_range_m = command_range_m
+        self._fit_map = fit_map
+        action_n = schema.vector_length(schema.FRAMES.field("action"))
+        assert action_n is not None
+        self.snapshot: PolicySnapshot = policy.initial(
+            schema.OBSERVATION_N,
+            action_n,
+            settings.hidden_layers,
+            self._rng(0, INITIAL_STREAM),
+            offset_m=offset_m,
+            scale_m=scale_m,
+        )
+        self._replayed: deque[Pairs] = deque(maxlen=settings.replay_iterations)
+        self._episodes: dict[int, pa.Table] = {}
+        self._segmented: _Segmented | None = None
+        self._fitted: _Fitted | None = None
+        self._improved: _Improved | None = None
+        self._supervised_loss = np.nan
+
+    def _rng(self, iteration: int, stream: int) -> np.random.Generator:
+        branch = (LEARNER_STREAM, iteration, stream)
+        return np.random.default_rng(np.random.SeedSequence(self._run_seed, spawn_key=branch))
+
+    def policy(self) -> PolicySnapshot:
+        """The policy that samples next."""
+        return self.snapshot
+
+    def add(self, frames: pa.Table) -> None:
+        """Take one episode of the iteration. Raises DataError when the learner already has it."""
+        episode_id = frames.column("episode_id")[0].as_py()
+        if episode_id in self._episodes:
+            raise DataError(f"episode {episode_id} was added twice in iteration {self.snapshot.version}")
+        self._episodes[episode_id] = frames
+
+    def segment(self) -> Iterator[tuple[int, int]]:
+        """Cut the episodes into segments and classify them (lines 3 to 5); the learner lets go of their tables."""
+        rows = read_rows(self._episodes, self._settings.reduced_state)
+        self._episodes.clear()
+        self._fitted = self._improved = None
+        yield 1, 2
+        segments = cut(rows, self._settings.longest_segment_steps)
+        groups = group(segments, self._settings.smallest_class_segments)
+        self._segmented = _Segmented(rows, segments, groups)
+        yield 2, 2
+
+    def fit(self) -> Iterator[tuple[int, int]]:
+        """Fit the local models of every class (line 6)."""
+        data = _of(self._segmented, "segment")
+        settings = self._settings
+        options = FitOptions(settings.modes, settings.residual_threshold, settings.prior_samples, settings.ridge)
+        jobs = surrogate.jobs(data.rows, data.segments, data.groups, options, self._run_seed, self.snapshot.version)
+        if not jobs:
+            raise DataError("no transition of this iteration can be learned from: every step ends in a jump")
+        fits = {}
+        for number, fitted in zip(jobs, self._fit_map(surrogate.fit_class, list(jobs.values())), strict=True):
+            fits[number] = fitted
+            yield len(fits), len(jobs)
+        patch = surrogate.patch(list(jobs.values()), list(fits.values()), len(data.rows.acts))
+        self._fitted = _Fitted(fits, patch)
+
+    def backward_pass(self) -> Iterator[tuple[int, int]]:
+        """Improve the actions along all sub-trajectories (lines 8 to 11)."""
+        rows, patch = _of(self._segmented, "segment").rows, _of(self._fitted, "fit").patch
+        settings, index = self._settings, np.flatnonzero(rows.continues)
+        weights = self._target_speed_m_per_s, self._vertical_weight
+        gradient = cost.gradient(rows.state, rows.target, *weights)
+        hessian = cost.hessian(rows.state.shape[1], self._vertical_weight)
+        deviation, variance = self._deviation(rows, patch)
+        models = lqg.prepare(patch.models, settings.kl_weight, variance)
+        improved = np.full_like(rows.action, np.nan)
+        pieces = lqg.sub_trajectories(rows.continues, settings.horizon_steps)
+        total, done, change = sum(map(len, pieces.values())), 0, 0.0
+        for length, starts in pieces.items():
+            for first in range(0, len(starts), CHUNK):
+                steps = starts[first : first + CHUNK, None] + np.arange(length)
+                result = lqg.backward_pass(models, patch.of_row[steps], gradient[steps + 1], hessian, deviation[steps])
+                improved[steps] = rows.action[steps] + result.k
+                change += float(result.predicted_cost_change.sum())
+                done += len(steps)
+                yield done, total
+        actions = np.clip(improved[index], *self._command_range_m).astype(np.float32)
+        report = {
+            "sub_trajectories": total,
+            "predicted_cost_change": change / len(index),
+            "action_change_m": _root_mean_square(actions - rows.action_mean[index]),
+        }
+        self._improved = _Improved((rows.observation[index], actions), report)
+
+    def _deviation(self, rows: Rows, patch: surrogate.Patch) -> tuple[NDArray[np.float32], float | None]:
+        """Recorded action minus policy mean [n, nu], and the exploration variance if it is to replace the fitted S."""
+        deviation = rows.action - rows.action_mean
+        if self._settings.deviation_from == "recorded":
+            return deviation, _root_mean_square(deviation[rows.continues]) ** 2
+        P, p = (array.astype(np.float32) for array in (patch.models.P, patch.models.p))
+        for model in np.unique(patch.of_row[rows.continues]):
+            chosen = np.flatnonzero(patch.of_row == model)
+            deviation[chosen] = rows.action[chosen] - rows.state[chosen] @ P[model].T - p[model]
+        return deviation, None
+
+    def supervise(self) -> Iterator[tuple[int, int]]:
+        """Train the policy on this iteration's pairs and the replayed ones (line 13)."""
+        pairs = _of(self._improved, "backward_pass").pairs
+        observations, actions = (np.concatenate(part) for part in zip(*self._replayed, pairs, strict=True))
+        rng = self._rng(self.snapshot.version, SUPERVISED_STREAM)
+        training = supervised.train(self.snapshot, observations, actions, self._settings, rng)
+        self.snapshot, self._supervised_loss = yield from training
+        self._replayed.append(pairs)
+
+    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        """The learner's columns of `iterations` and the rows of `classes` of the iteration just finished."""
+        data, fitted = _of(self._segmented, "segment"), _of(self._fitted, "fit")
+        modes = np.concatenate([fit.modes[fit.modes > 0] for fit in fitted.fits.values()])
+        iteration = {
+            "segments": len(data.segments.start),
+            "classes": sum(not group.pooled for group in data.groups),
+            "modes": float(modes.mean()),
+            "residual": float(np.nanmean(fitted.patch.residual)),
+            **_of(self._improved, "backward_pass").report,
+            "supervised_loss": self._supervised_loss,
+        }
+        return iteration, self._class_rows(data, fitted)
+
+    def _class_rows(self, data: _Segmented, fitted: _Fitted) -> list[dict[str, Any]]:
+        lengths, rows = data.segments.stop - data.segments.start, []
+        for number, group_ in enumerate(data.groups):
+            fit = fitted.fits.get(number)
+            crosses = group_.key.exit != NONE
+            for key, members in group_.classes.items():
+                residual = fitted.patch.residual[np.isin(data.segments.of_row, members)]
+                sampled = np.isfinite(residual)
+                rows.append(
+                    {
+                        "iteration": self.snapshot.version - 1,
+                        "kind": key.kind,
+                        "entry_edge": None if key.entry == NONE else key.entry,
+                        "exit_edge": None if key.exit == NONE else key.exit,
+                        "truncated": key.truncated,
+                        "segments": len(members),
+                        "rows": int(lengths[members].sum()),
+                        "time_steps": warping.class_steps(lengths[group_.segments], crosses),
+                        "pooled": group_.pooled,
+                        "modes": float(fit.modes[fit.modes > 0].mean()) if fit else 0.0,
+                        "residual": float(residual[sampled].mean()) if sampled.any() else 0.0,
+                    }
+                )
+        return rows
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        """What the next iteration depends on, between two iterations: policy and replayed pairs."""
+        arrays: dict[str, NDArray[Any]] = {}
+        for number, (weight, bias) in enumerate(self.snapshot.layers):
+            arrays[f"layer_{number}_weight"], arrays[f"layer_{number}_bias"] = weight, bias
+        for number, (observations, actions) in enumerate(self._replayed):
+            arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"] = observations, actions
+        manifest = {
+            "version": self.snapshot.version,
+            "offset_m": self.snapshot.offset_m,
+            "scale_m": self.snapshot.scale_m,
+            "layers": len(self.snapshot.layers),
+            "replays": len(self._replayed),
+        }
+        return manifest, arrays
+
+    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        """Continue from `state()`. Raises CheckpointError when entries are missing or the network has another shape."""
+        try:
+            layers = tuple(
+                (arrays[f"layer_{number}_weight"], arrays[f"layer_{number}_bias"])
+                for number in range(manifest["layers"])
+            )
+            replayed = [
+                (arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"])
+                for number in range(manifest["replays"])
+            ]
+            restored = PolicySnapshot(manifest["version"], layers, manifest["offset_m"], manifest["scale_m"])
+        except KeyError as error:
+            raise CheckpointError(f"the learner's checkpoint lacks {error}; use an older checkpoint") from error
+        found = [weight.shape for weight, _ in layers]
+        expected = [weight.shape for weight, _ in self.snapshot.layers]
+        if found != expected:
+            raise CheckpointError(
+                f"the checkpoint's policy has layers {found}, the settings ask for {expected}; "
+                "set hidden_layers as in the run that wrote it"
+            )
+        self.snapshot = restored
+        self._replayed = deque(replayed, maxlen=self._settings.replay_iterations)
+        self._episodes.clear()
+
+
+def _of(result: Phase | None, phase: str) -> Phase:
+    if result is None:
+        raise RunError(f"{phase}() must come first; an iteration runs segment, fit, backward_pass, supervise")
+    return result
+
+
+def _root_mean_square(values: NDArray[np.float32]) -> float:
+    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

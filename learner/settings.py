@@ -1,0 +1,34 @@
+"""Settings of the C-step and the S-step; defaults and their grounds are in docs/algorithm.md."""
+
+from typing import Annotated, Literal
+
+from pydantic import Field
+
+from t6gps.storage.settings import Settings
+
+ReducedState = Literal["com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables"]
+LayerWidth = Annotated[int, Field(ge=1, le=4096)]
+
+
+class LearnerSettings(Settings):
+    """How trajectories become local models (III-A to III-E), improved actions (III-F) and a policy (II-A)."""
+
+    reduced_state: ReducedState = Field("nodes", description="what the surrogate models predict (Sec. IV-C)")
+    longest_segment_steps: int = Field(20, ge=2, le=1000, description="longer stays on a triangle are cut (steps)")
+    smallest_class_segments: int = Field(40, ge=1, description="rarer classes share models (segments)")
+    modes: int = Field(4, ge=1, le=16, description="most modes per class and time step")
+    residual_threshold: float = Field(0.35, gt=0.0, le=10.0, description="outliers lie beyond (standard deviations)")
+    prior_samples: float = Field(500.0, ge=0.0, le=1e6, description="weight of the pooled model, n0 (samples)")
+    ridge: float = Field(1e-3, gt=0.0, le=1.0, description="ridge relative to the variance of a regressor")
+    horizon_steps: int = Field(10, ge=1, le=1000, description="length of a sub-trajectory (steps)")
+    kl_weight: float = Field(0.02, gt=0.0, le=100.0, description="weight of the KL term, c (m2/s2)")
+    deviation_from: Literal["recorded", "fitted"] = Field(
+        "recorded", description="the KL term is centred on the recorded policy mean or on the fitted p(x)"
+    )
+    hidden_layers: tuple[LayerWidth, ...] = Field(
+        (256, 256, 256), strict=False, min_length=1, max_length=8, description="tanh units per hidden layer"
+    )
+    epochs: int = Field(8, ge=1, le=1000, description="passes over the pairs per S-step")
+    batch: int = Field(512, ge=1, le=100_000, description="pairs per gradient step")
+    learning_rate: float = Field(1e-3, gt=0.0, le=1.0, description="initial step of Adam, decays to zero")
+    replay_iterations: int = Field(1, ge=0, le=10, description="earlier iterations whose pairs are used again")

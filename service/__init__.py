@@ -1,0 +1,15 @@
+"""The service: configuration, executors, the training loop and the command line.
+
+What must be set before numpy and ray are loaded stands here. Every process computes with one thread: parallelism comes
+from processes, and results do not depend on how a library splits its sums. An embedded Ray talks only to processes that
+know the token of this one.
+"""
+
+import os
+import secrets
+
+for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
+    os.environ[_name] = "1"
+if "RAY_ADDRESS" not in os.environ:
+    os.environ.setdefault("RAY_AUTH_MODE", "token")
+    os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))

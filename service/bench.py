@@ -1,0 +1,38 @@
+"""Benchmarks by name. Each figure that claims speed is a ratio to a reference measured in the same run."""
+
+from __future__ import annotations
+
+import difflib
+import importlib
+import subprocess
+from collections.abc import Callable
+from importlib import metadata
+from pathlib import Path
+from typing import Any
+
+from t6gps.storage.errors import ConfigError
+
+BENCHMARKS = {"physics": "t6gps.workers.benchmarks", "soundness": "t6gps.workers.soundness"}
+"""Module of each benchmark; the function in it has the benchmark's name."""
+
+
+def measure(name: str) -> dict[str, Any]:
+    """Run a benchmark: {"bench", "commit", "threads", "results": {key: number}}. ConfigError for an unknown name."""
+    if name not in BENCHMARKS:
+        close = difflib.get_close_matches(name, BENCHMARKS, n=1)
+        hint = f" (did you mean {close[0]}?)" if close else ""
+        raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
+    run: Callable[[], dict[str, float]] = getattr(importlib.import_module(BENCHMARKS[name]), name)
+    return {"bench": name, "commit": _commit(), "threads": 1, "results": run()}
+
+
+def _commit() -> str:
+    """The checked-out commit, or the version of an installed package."""
+    folder = Path(__file__).parent
+    git = subprocess.run(
+        ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return git.stdout.strip() if git.returncode == 0 else metadata.version("t6gps")

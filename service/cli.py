@@ -1,0 +1,364 @@
+"""The command line `t6gps`. Results go to stdout, progress and messages to stderr; bad input exits with 2.
+
+What is slow to import (ray, torch, matplotlib) is imported by the commands that need it, so that the others answer
+at once.
+"""
+
+from __future__ import annotations
+
+import json
+import shlex
+import signal
+import sys
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any
+
+import pyarrow.compute as pc
+import typer
+
+from t6gps.service import bench as benchmarks
+from t6gps.service import config as configuration
+from t6gps.service import display, evaluation, run
+from t6gps.service.config import Config
+from t6gps.service.display import console
+from t6gps.service.executor import Executor
+from t6gps.storage import catalog, checkpoint, tables
+from t6gps.storage import query as sql_query
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError, RunError, T6GpsError
+
+if TYPE_CHECKING:
+    from t6gps.workers.physics import Simulation
+
+app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+
+EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "run.steps", "run.workers")
+EXPORT_SECTIONS = ("robot.", "terrain.")
+
+Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
+]
+Serial = Annotated[bool, typer.Option("--serial", help="Run in this process, without Ray; same data.")]
+Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers (changes the speed only).")]
+RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+DEFAULT_ROOT = Path("runs")
+
+
+class Engine(StrEnum):
+    """Simulators of the robot."""
+
+    BULLET = "bullet"
+    MUJOCO = "mujoco"
+
+
+class ExportFormat(StrEnum):
+    """Formats in which the robot leaves."""
+
+    MJCF = "mjcf"
+
+
+class QueryFormat(StrEnum):
+    """Formats of a query's result."""
+
+    TABLE = "table"
+    CSV = "csv"
+    JSON = "json"
+    ARROW = "arrow"
+
+
+def main() -> None:
+    """Entry point of the command."""
+    try:
+        app()
+    except T6GpsError as error:
+        message = str(error)
+    except OSError as error:
+        message = (
+            f"{error.filename or 'the system'}: {error.strerror or error}; make room or give access, then try again"
+        )
+    else:
+        return
+    console.print(f"error: {message}", style="red", highlight=False, soft_wrap=True, markup=False)
+    sys.exit(EXIT_BAD_INPUT)
+
+
+@app.command()
+def train(
+    source: Annotated[str, typer.Argument(metavar="PRESET|FILE.toml", help="Preset name or TOML file.")],
+    run_name: Annotated[str | None, typer.Option("--run", help="Name of the run; by default the preset's.")] = None,
+    root: Root = DEFAULT_ROOT,
+    workers: Workers = None,
+    serial: Serial = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    overrides: Overrides = None,
+) -> None:
+    """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
+    from t6gps.service import figures
+
+    config = configuration.load(source, _with_workers(overrides, workers))
+    name = Path(source).stem if run_name is None else run_name
+    if resume:
+        this = catalog.open_run(root, name)
+        _check_unchanged(this, config)
+    else:
+        this = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
+    with catalog.locked(this):
+        try:
+            with closing(_executor(config, serial)) as executor:
+                with display.ProgressDisplay(config.run.iterations) as progress:
+                    run.train(config, this, executor, progress)
+                result = _evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+        except KeyboardInterrupt:
+            console.print(
+                f"stopped; everything sampled so far is kept. Go on with: {_again(this, source, root, overrides)}",
+                highlight=False,
+                soft_wrap=True,
+            )
+            raise typer.Exit(EXIT_INTERRUPTED) from None
+        evaluation.keep(this, result)
+        pictures = figures.draw(this, config.terrain)
+    _print_learning(this)
+    display.print_evaluation(result)
+    _print_paths(this, pictures, root)
+
+
+@app.command(name="eval")
+def evaluate(
+    run_name: RunName,
+    root: Root = DEFAULT_ROOT,
+    episodes: Annotated[int, typer.Option(min=2, help="Noise-free episodes.")] = 40,
+    seed: Annotated[int, typer.Option(min=0, help="Seed of starts and waypoints; never one of training.")] = 1,
+    terrain_seed: Annotated[int | None, typer.Option(min=0, help="Seed of the ground alone.")] = None,
+    overrides: Overrides = None,
+    workers: Workers = None,
+    serial: Serial = False,
+    engine: Annotated[Engine, typer.Option(help="mujoco cross-checks, as with --serial.")] = Engine.BULLET,
+    as_json: Json = False,
+) -> None:
+    """Evaluate a run's newest policy without noise on unseen seeds."""
+    this = catalog.open_run(root, run_name)
+    _check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
+    config = configuration.parse(this.config_path.read_text(), _with_workers(overrides, workers))
+    latest = checkpoint.load_latest(this.checkpoints)
+    if latest is None:
+        raise RunError(f"run {run_name} has no checkpoint yet; let it finish an iteration")
+    with closing(_executor(config, serial, engine)) as executor:
+        executor.ask("restore", *latest[1:])
+        result = _evaluated(config, executor, episodes, seed, terrain_seed)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        display.print_evaluation(result)
+
+
+@app.command()
+def runs(root: Root = DEFAULT_ROOT) -> None:
+    """List the runs."""
+    if not root.is_dir():
+        raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
+    rows = []
+    for this in catalog.list_runs(root):
+        last = tables.read(this, "iterations").sort_by("iteration").to_pylist()[-1:]
+        done = len(last) and last[0]["iteration"] + 1
+        wanted = configuration.parse(this.config_path.read_text()).run.iterations
+        rows.append(
+            {
+                "run": this.name,
+                "iterations": f"{done} of {wanted}",
+                "cost": last[0]["cost"] if last else None,
+                "forward_speed_m_per_s": last[0]["forward_speed_m_per_s"] if last else None,
+            }
+        )
+    columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
+    columns |= {key: display.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
+    display.print_rows(f"Runs in {root}", rows, columns)
+
+
+@app.command()
+def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
+    """Show a run: learning curve, segment classes of the last iteration, evaluation, files."""
+    this = catalog.open_run(root, run_name)
+    if not tables.committed_iterations(this):
+        typer.echo(f"run {run_name} has not finished an iteration yet")
+        return
+    _print_learning(this)
+    classes = tables.read(this, "classes").to_pylist()
+    last = max((row["iteration"] for row in classes), default=-1)
+    rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
+    display.print_rows(f"Segment classes of iteration {last}", rows, display.CLASS_COLUMNS)
+    result = evaluation.kept(this)
+    if result:
+        display.print_evaluation(result)
+    _print_paths(this, sorted(this.figures.glob("*.png")), root)
+
+
+@app.command()
+def query(
+    run_name: RunName,
+    sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT over frames, episodes, iterations, classes.")],
+    root: Root = DEFAULT_ROOT,
+    form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
+) -> None:
+    """Query a run's stored trajectories with SQL."""
+    display.write_table(sql_query.query(catalog.open_run(root, run_name), sql), form.value)
+
+
+@app.command()
+def render(
+    run_name: RunName,
+    episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
+    out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
+    root: Root = DEFAULT_ROOT,
+    step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
+    strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
+) -> None:
+    """Draw a stored episode from its recorded states: a still, a strip of snapshots, or a film."""
+    from t6gps.workers import render as rendering
+    from t6gps.workers.ground import ground
+
+    this = catalog.open_run(root, run_name)
+    frames = tables.episode_frames(this, episode)
+    row = tables.read(this, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
+    config = configuration.parse(this.config_path.read_text())
+    terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+    with display.task("rendering") as progress:
+        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress)
+    typer.echo(out)
+
+
+@app.command()
+def export(
+    form: Annotated[ExportFormat, typer.Argument(metavar="mjcf", help="MuJoCo's model format.")],
+    out: Annotated[Path, typer.Argument(metavar="FILE.xml", help="File to write.")],
+    terrain_seed: Annotated[int, typer.Option(min=0, help="Seed of rough ground (--set terrain.difficulty=1).")] = 0,
+    root: Root = DEFAULT_ROOT,
+    overrides: Overrides = None,
+) -> None:
+    """Write the robot and its ground as a model for other tools."""
+    from t6gps.workers.ground import ground
+    from t6gps.workers.mjcf import to_mjcf
+
+    _check_keys(overrides, f"export {form.value}", EXPORT_SECTIONS, "the model has only a robot and its ground")
+    config = configuration.parse("{}", overrides or [], "--set")
+    text = to_mjcf(config.robot, ground(config.terrain, terrain_seed, config.terrain.difficulty))
+    try:
+        out.write_text(text)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}; name a file in an existing folder") from None
+    typer.echo(out)
+
+
+@app.command()
+def bench(
+    name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
+    root: Root = DEFAULT_ROOT,
+    as_json: Json = False,
+) -> None:
+    """Measure speed, each figure beside a reference of the same run."""
+    result = benchmarks.measure(name)
+    if as_json:
+        typer.echo(json.dumps(result))
+    else:
+        rows = [{"key": key, "value": value} for key, value in result["results"].items()]
+        title = f"{name} at commit {result['commit']}, {result['threads']} thread(s)"
+        display.print_rows(title, rows, {"key": ("key", "{}"), "value": ("value", "{:.4g}")})
+
+
+def _executor(config: Config, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
+    executor: Executor
+    if serial or engine is Engine.MUJOCO:
+        from t6gps.service.serial import SerialExecutor
+
+        executor = SerialExecutor(config, _simulation(engine))
+    else:
+        from t6gps.service.actors import RayExecutor
+
+        executor = RayExecutor(config)
+    # After the executor is made, since Ray sets a handler of its own.
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+    return executor
+
+
+def _simulation(engine: Engine) -> type[Simulation]:
+    if engine is Engine.MUJOCO:
+        from t6gps.workers.mujoco_engine import MujocoSimulation
+
+        return MujocoSimulation
+    from t6gps.workers.physics import Simulation
+
+    return Simulation
+
+
+def _check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, ...], reason: str) -> None:
+    for override in overrides or []:
+        if not override.startswith(allowed):
+            raise ConfigError(
+                f"{command} cannot change {override.partition('=')[0]}: {reason}; "
+                f"allowed: keys that start with {', '.join(allowed)}"
+            )
+
+
+def _with_workers(overrides: list[str] | None, workers: int | None) -> list[str]:
+    return (overrides or []) + ([] if workers is None else [f"run.workers={workers}"])
+
+
+def _free_name(root: Path, name: str) -> str:
+    """`name`, or the first of name-2, name-3, ... that no run has."""
+    taken = {this.name for this in catalog.list_runs(root)}
+    number = 2
+    free = name
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free
+
+
+def _check_unchanged(this: Run, config: Config) -> None:
+    stored = configuration.parse(this.config_path.read_text())
+    changed = configuration.differences(stored, config)
+    if changed:
+        raise RunError(
+            f"--resume must keep the configuration of run {this.name}, found {'; '.join(changed)}; "
+            "repeat the run's settings, or start a new run with --run"
+        )
+
+
+def _again(this: Run, source: str, root: Path, overrides: list[str] | None) -> str:
+    parts = ["t6gps", "train", source, "--run", this.name, "--root", str(root), "--resume"]
+    return shlex.join(parts + [f"--set={override}" for override in overrides or []])
+
+
+def _evaluated(
+    config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None
+) -> evaluation.Evaluation:
+    with display.ProgressDisplay(config.run.iterations) as progress:
+        return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, progress)
+
+
+def _print_learning(this: Run) -> None:
+    rows: list[dict[str, Any]] = tables.read(this, "iterations").sort_by("iteration").to_pylist()
+    display.print_rows(f"Run {this.name}", rows, display.LEARNING_COLUMNS)
+
+
+def _print_paths(this: Run, pictures: list[Path], root: Path) -> None:
+    place = f" --root {shlex.quote(str(root))}" if root != DEFAULT_ROOT else ""
+    lines = [
+        f"dataset      {this.tables}",
+        f"checkpoints  {this.checkpoints}",
+        *(f"figure       {picture}" for picture in pictures),
+        "",
+        "Try next:",
+        f"  t6gps eval {this.name} --episodes 40 --seed 7{place}",
+        f'  t6gps query {this.name} "SELECT iteration, avg(forward_speed_m_per_s) AS m_per_s FROM episodes '
+        f'GROUP BY iteration ORDER BY iteration"{place}',
+        f"  t6gps render {this.name} 0 --out episode.mp4{place}",
+    ]
+    typer.echo("\n".join(lines))
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,181 @@
+"""The configuration of a run: a preset or a TOML file, overrides, and what to say when something is wrong."""
+
+from __future__ import annotations
+
+import difflib
+import json
+import tomllib
+from collections.abc import Sequence
+from importlib import resources
+from pathlib import Path
+from typing import Any
+
+from pydantic import BaseModel, Field, ValidationError
+
+from t6gps.learner.settings import LearnerSettings
+from t6gps.storage.errors import ConfigError
+from t6gps.storage.settings import Settings
+from t6gps.workers.settings import RolloutSettings
+
+
+class RunSettings(Settings):
+    """Size of a run: N episodes of T control steps in each of I iterations (paper Sec. IV-A)."""
+
+    seed: int = Field(0, ge=0, lt=2**63, description="root of every random stream of the run")
+    iterations: int = Field(5, ge=1, le=10000, description="iterations I")
+    episodes: int = Field(300, ge=1, le=1000000, description="episodes of an iteration, N")
+    steps: int = Field(250, ge=2, le=100000, description="control steps of an episode, T (10 per second)")
+    workers: int = Field(2, ge=1, le=10000, description="rollout workers; changes the speed, never the data")
+    evaluation_episodes: int = Field(40, ge=2, le=100000, description="noise-free episodes after the last iteration")
+
+
+class Config(RolloutSettings):
+    """Everything that a run's data depends on (and the number of workers)."""
+
+    run: RunSettings = RunSettings()
+    learner: LearnerSettings = LearnerSettings()
+
+    @property
+    def rollout(self) -> RolloutSettings:
+        """The part that the workers need."""
+        return RolloutSettings(**{name: getattr(self, name) for name in RolloutSettings.model_fields})
+
+    def to_json(self) -> str:
+        """The configuration as the run keeps it."""
+        return self.model_dump_json(indent=2) + "\n"
+
+
+def presets() -> list[str]:
+    """Names of the presets that ship with the package."""
+    folder = resources.files("t6gps.deploy") / "presets"
+    return sorted(Path(item.name).stem for item in folder.iterdir() if item.name.endswith(".toml"))
+
+
+def load(source: str, overrides: Sequence[str] = ()) -> Config:
+    """Configuration from a preset's name or a TOML file, with overrides `key=value` (dotted key, TOML value).
+
+    ConfigError if the source is unknown or not TOML, or a key or value is not allowed.
+    """
+    if source in presets():
+        text = (resources.files("t6gps.deploy") / "presets" / f"{source}.toml").read_text()
+    elif source.endswith(".toml"):
+        try:
+            text = Path(source).read_text()
+        except (OSError, UnicodeDecodeError) as error:
+            raise ConfigError(f"cannot read the configuration file {source}: {error}; give an existing file") from None
+    else:
+        raise ConfigError(
+            f"unknown preset '{source}'{_nearest(source, presets())}; "
+            f"allowed: {', '.join(presets())}, or the path of a file that ends in .toml"
+        )
+    try:
+        values = tomllib.loads(text)
+    except tomllib.TOMLDecodeError as error:
+        raise ConfigError(f"{source} is not TOML: {error}; correct the file") from None
+    return _checked_world(_validated(_overridden(values, overrides), source))
+
+
+def _checked_world(config: Config) -> Config:
+    """The configuration, its robot seen to stand and its ground's file, if any, seen to be ground; with its whole path.
+
+    PhysicsError or TerrainError otherwise.
+    """
+    from t6gps.workers.ground import ground
+    from t6gps.workers.start import check_stance
+
+    check_stance(config.robot)
+    spread = config.randomisation
+    weakest = {
+        "bar_mass_kg": config.robot.bar_mass_kg * (1 + spread.mass_spread),
+        "cable_stiffness_n_per_m": config.robot.cable_stiffness_n_per_m * (1 - spread.stiffness_spread),
+    }
+    if spread.mass_spread or spread.stiffness_spread:
+        check_stance(config.robot.model_copy(update=weakest))
+    if not config.terrain.file:
+        return config
+    terrain = config.terrain.model_copy(update={"file": str(Path(config.terrain.file).resolve())})
+    ground(terrain, 0, terrain.difficulty)
+    return config.model_copy(update={"terrain": terrain})
+
+
+def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") -> Config:
+    """Configuration that a run keeps (`Config.to_json`), with overrides. ConfigError as for `load`."""
+    try:
+        values = json.loads(text)
+    except json.JSONDecodeError as error:
+        raise ConfigError(f"{where} is not JSON: {error}; restore the file from a backup") from None
+    config = _validated(_overridden(values, overrides), where)
+    return _checked_world(config) if overrides else config
+
+
+def differences(stored: Config, wanted: Config) -> list[str]:
+    """Keys whose values differ, with both values; the number of workers may differ."""
+    a, b = _flat(stored.model_dump()), _flat(wanted.model_dump())
+    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key != "run.workers"]
+
+
+def _overridden(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
+    values = json.loads(json.dumps(values))
+    for override in overrides:
+        key, equals, text = override.partition("=")
+        if not equals or not key.strip():
+            raise ConfigError(f"--set takes key=value, found '{override}'; for example --set run.seed=3")
+        try:
+            value = tomllib.loads(f"value = {text}")["value"]
+        except tomllib.TOMLDecodeError:
+            value = text
+        *sections, name = key.strip().split(".")
+        table = values
+        for section in sections:
+            table = table.setdefault(section, {})
+            if not isinstance(table, dict):
+                raise ConfigError(f"--set {key}: {section} is not a section; allowed: {', '.join(_known_keys())}")
+        table[name] = value
+    return values
+
+
+def _validated(values: dict[str, Any], where: str) -> Config:
+    try:
+        text = json.dumps(values)
+    except TypeError as error:
+        raise ConfigError(f"{where}: {error}; use numbers, strings, booleans and lists") from None
+    try:
+        return Config.model_validate_json(text)
+    except ValidationError as error:
+        raise ConfigError(f"{where}: " + "; ".join(_sentence(dict(item)) for item in error.errors())) from None
+
+
+def _sentence(item: dict[str, Any]) -> str:
+    key = ".".join(str(part) for part in item["loc"])
+    if item["type"] == "extra_forbidden":
+        return f"unknown key {key}{_nearest(key, _known_keys())}; allowed: {', '.join(_siblings(key))}"
+    found = "" if isinstance(item["input"], dict) else f", found {item['input']!r}"
+    message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
+    return f"{key} {message}{found}"
+
+
+def _siblings(key: str) -> list[str]:
+    section = key.rpartition(".")[0]
+    known = [name for name in _known_keys() if name.rpartition(".")[0] == section]
+    return known or sorted({name.partition(".")[0] for name in _known_keys()})
+
+
+def _known_keys() -> list[str]:
+    return [
+        f"{section}.{name}"
+        for section, field in Config.model_fields.items()
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
+        for name in field.annotation.model_fields
+    ]
+
+
+def _nearest(name: str, names: Sequence[str]) -> str:
+    close = difflib.get_close_matches(name, names, n=1)
+    return f" (did you mean {close[0]}?)" if close else ""
+
+
+def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
+    flat: dict[str, Any] = {}
+    for key, value in values.items():
+        flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
+    return flat

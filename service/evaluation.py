@@ -1,0 +1,57 @@
+"""How well a policy does without noise, on seeds that it was not trained on."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import pyarrow as pa
+
+from t6gps.service import seeding
+from t6gps.service.config import Config
+from t6gps.service.executor import Executor
+from t6gps.service.run import Observer, mean_and_error
+from t6gps.storage import durable
+from t6gps.storage.catalog import Run
+
+EVALUATED = {
+    "forward_speed_m_per_s": "forward_speed_m_per_s",
+    "stuck_share": "stuck_share",
+    "waypoints_per_episode": "waypoints_reached",
+    "cost": "cost",
+}
+"""Reported quantities and the columns of `episodes` they summarise."""
+
+Evaluation = dict[str, Any]
+"""`episodes`, `seed`, and of each of EVALUATED its mean and standard error over episodes."""
+
+
+def evaluate(
+    config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None, observer: Observer
+) -> Evaluation:
+    """Run the learner's policy in `episodes` noise-free episodes."""
+    snapshot = executor.ask("policy")
+    plans = seeding.evaluation_plans(config, episodes, seed, terrain_seed, snapshot.version)
+    summaries = {}
+    for episode in executor.sample(plans, snapshot):
+        summaries[episode.summary["index"][0].as_py()] = episode.summary
+        observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
+    table = pa.concat_tables([summaries[index] for index in sorted(summaries)])
+    result: Evaluation = {"episodes": episodes, "seed": seed}
+    for key, column in EVALUATED.items():
+        mean, error = mean_and_error(table[column].to_numpy().astype(float))
+        result[key] = {"mean": mean, "standard_error": error}
+    return result
+
+
+def keep(run: Run, evaluation: Evaluation) -> None:
+    """Keep the evaluation that ended the training beside the run's tables."""
+    path = run.path / "evaluation.json"
+    durable.hidden(path).write_text(json.dumps(evaluation, indent=2) + "\n")
+    durable.publish(path)
+
+
+def kept(run: Run) -> Evaluation | None:
+    """The evaluation that ended the training, None before its end."""
+    path = run.path / "evaluation.json"
+    return json.loads(path.read_text()) if path.exists() else None

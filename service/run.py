@@ -1,0 +1,117 @@
+"""The training loop: sample, keep, learn, commit, checkpoint (paper Alg. 2, once per iteration).
+
+What a crash leaves behind decides where to go on. Episodes are in the spool as soon as they are acknowledged; an
+iteration's tables are committed once; the checkpoint comes last and the spool is emptied after it. So a resumed run
+takes the newest checkpoint, reads the spooled episodes of its iteration, samples the missing ones and learns again:
+each step depends on seeds alone, and committing an iteration a second time changes nothing.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from t6gps.service import seeding
+from t6gps.service.config import Config
+from t6gps.service.executor import PHASES, Executor
+from t6gps.storage import checkpoint, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.records import Episode
+from t6gps.storage.spool import Spool
+
+PHASE_TITLES = {
+    "sample": "sampling",
+    "segment": "segmenting",
+    "fit": "fitting",
+    "backward_pass": "backward pass",
+    "supervise": "supervised step",
+    "evaluate": "evaluation",
+}
+DURATION_COLUMNS = {
+    "sample": "sampling_s",
+    "segment": "segmenting_s",
+    "fit": "fitting_s",
+    "backward_pass": "backward_pass_s",
+    "supervise": "supervised_s",
+}
+
+
+class Observer(Protocol):
+    """Whoever watches a run."""
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        """A phase has advanced."""
+
+    def finished(self, row: dict[str, Any]) -> None:
+        """An iteration is committed; `row` goes into the iterations table."""
+
+
+def train(config: Config, run: Run, executor: Executor, observer: Observer) -> None:
+    """Run the iterations that are missing, from the newest checkpoint on."""
+    latest = checkpoint.load_latest(run.checkpoints)
+    first = 0
+    if latest is not None:
+        first, manifest, arrays = latest
+        executor.ask("restore", manifest, arrays)
+    for iteration in range(first, config.run.iterations):
+        _iterate(config, run, executor, observer, iteration)
+
+
+def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
+    durations: dict[str, float] = {}
+    spool = Spool(run.spool, iteration)
+    with _timed(durations, "sample"):
+        episodes = spool.episodes()
+        for episode in episodes.values():
+            executor.add(episode)
+        plans = seeding.training_plans(config, iteration)
+        missing = [plan for plan in plans if plan.episode_id not in episodes]
+        observer.progress(iteration, "sample", len(episodes), len(plans))
+        for episode in executor.sample(missing, executor.ask("policy")):
+            spool.append(episode)
+            executor.add(episode)
+            episodes[episode.summary["episode_id"][0].as_py()] = episode
+            observer.progress(iteration, "sample", len(episodes), len(plans))
+    for phase in PHASES:
+        with _timed(durations, phase):
+            for done, total in executor.learn(phase):
+                observer.progress(iteration, phase, done, total)
+    learned, classes = executor.ask("report")
+    ordered = [episodes[plan.episode_id] for plan in plans]
+    row = {"iteration": iteration, "policy_version": iteration, **_sampled(ordered), **learned, **durations}
+    tables.commit_iteration(run, iteration, ordered, row, classes)
+    checkpoint.save(run.checkpoints, iteration + 1, *executor.ask("state"))
+    spool.clear()
+    observer.finished(row)
+
+
+@contextmanager
+def _timed(durations: dict[str, float], phase: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    durations[DURATION_COLUMNS[phase]] = time.perf_counter() - start
+
+
+def _sampled(episodes: list[Episode]) -> dict[str, Any]:
+    """The part of an iteration's row that describes its episodes."""
+    summary = pa.concat_tables([episode.summary for episode in episodes])
+    result: dict[str, Any] = {"episodes": len(episodes), "steps": int(np.sum(summary["steps"].to_numpy()))}
+    for column, error in (
+        ("cost", "cost_standard_error"),
+        ("forward_speed_m_per_s", "forward_speed_standard_error"),
+    ):
+        result[column], result[error] = mean_and_error(summary[column].to_numpy())
+    result["stuck_share"] = float(summary["stuck_share"].to_numpy().mean())
+    result["waypoints_per_episode"] = float(summary["waypoints_reached"].to_numpy().mean())
+    return result
+
+
+def mean_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Mean and standard error over episodes (0 for a single one)."""
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(values.mean()), float(error)

@@ -1,0 +1,69 @@
+"""Every random stream of a run hangs on one tree: (run seed, purpose, iteration, episode), never on a worker."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from t6gps.service.config import Config
+from t6gps.storage.records import EpisodePlan
+
+TRAINING, LEARNER, EVALUATION, EVALUATION_TERRAIN = range(4)
+"""First spawn key below the run's seed; the learner room uses LEARNER = 1 for its own streams."""
+
+
+def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
+    """Plans of an iteration; they depend on the configuration and the iteration alone."""
+    size = config.run.episodes
+    return [
+        _plan(
+            config,
+            seeds=_seeds(config.run.seed, TRAINING, iteration, index),
+            episode_id=iteration * size + index,
+            iteration=iteration,
+            index=index,
+            noise_std_m=config.exploration.noise_std_m,
+            version=iteration,
+        )
+        for index in range(size)
+    ]
+
+
+def evaluation_plans(
+    config: Config, episodes: int, seed: int, terrain_seed: int | None, version: int
+) -> list[EpisodePlan]:
+    """Noise-free plans on seeds that no training plan uses; the terrain changes with `terrain_seed` if given."""
+    plans = []
+    for index in range(episodes):
+        start, terrain = _seeds(seed, EVALUATION, index)
+        if terrain_seed is not None:
+            terrain = _seeds(terrain_seed, EVALUATION_TERRAIN, index)[1]
+        plans.append(_plan(config, (start, terrain), index, version, index, noise_std_m=0.0, version=version))
+    return plans
+
+
+def _plan(
+    config: Config,
+    seeds: tuple[int, int],
+    episode_id: int,
+    iteration: int,
+    index: int,
+    noise_std_m: float,
+    version: int,
+) -> EpisodePlan:
+    return EpisodePlan(
+        episode_id=episode_id,
+        iteration=iteration,
+        index=index,
+        seed=seeds[0],
+        steps=config.run.steps,
+        terrain_seed=seeds[1],
+        terrain_difficulty=config.terrain.difficulty,
+        noise_std_m=noise_std_m,
+        policy_version=version,
+    )
+
+
+def _seeds(root: int, *key: int) -> tuple[int, int]:
+    """Two 63-bit seeds: of the episode and of its terrain."""
+    first, second = np.random.SeedSequence(root, spawn_key=key).generate_state(2, np.uint64) >> np.uint64(1)
+    return int(first), int(second)

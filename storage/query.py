@@ -1,0 +1,86 @@
+"""SQL over the tables of a run, safe for questions from strangers.
+
+DuckDB runs in a child process (`sandbox`) that sees the four tables and nothing else: no files, no network,
+no settings; one SELECT, bounded in length, nesting, memory, time and result.
+"""
+
+from __future__ import annotations
+
+import json
+import mmap
+import os
+import subprocess
+import sys
+import tempfile
+
+import pyarrow as pa
+
+from t6gps.storage import sandbox, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import QueryError
+
+SQL_BYTES_N = 64 * 1024
+BRACKET_DEPTH_N = 100
+# Allocators that reserve address space per thread would eat the child's bound before the query starts.
+_ENVIRONMENT = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1"}
+
+
+def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
+    """The result of one SELECT over the tables frames, episodes, iterations and classes of `run`.
+
+    Only committed iterations are seen. Raises QueryError, with DuckDB's own sentence first where there is
+    one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a
+    result of 1 GB or `timeout_s` seconds.
+    """
+    _check_size(sql)
+    iterations_n, files = tables.files(run)
+    question = json.dumps({"sql": sql, "iterations_n": iterations_n, "files": files, "timeout_s": timeout_s})
+    with tempfile.TemporaryFile() as result:
+        try:
+            child = subprocess.run(
+                [sys.executable, "-P", "-m", sandbox.__name__],
+                input=question.encode(),
+                stdout=result,
+                stderr=subprocess.PIPE,
+                env={**os.environ, **_ENVIRONMENT},
+                timeout=timeout_s,
+                check=False,
+            )
+        except subprocess.TimeoutExpired as error:
+            raise QueryError(
+                f"the query was stopped after {timeout_s:g} s; ask for fewer rows or columns, filter by "
+                "iteration, or read the Parquet files directly"
+            ) from error
+        if child.returncode:
+            raise QueryError(_reason(child.returncode, child.stderr.decode(errors="replace").strip()))
+        return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
+
+
+def _check_size(sql: str) -> None:
+    try:
+        size_n = len(sql.encode())
+    except UnicodeEncodeError as error:
+        raise QueryError(f"the SQL is not valid Unicode: {error}; remove that character") from error
+    depth = deepest = 0
+    for character in sql:
+        depth += (character in "([{") - (character in ")]}")
+        deepest = max(deepest, depth)
+    if size_n > SQL_BYTES_N:
+        raise QueryError(f"the SQL has {size_n} bytes; at most {SQL_BYTES_N} are allowed; split the question")
+    if deepest > BRACKET_DEPTH_N:
+        raise QueryError(f"the SQL nests {deepest} brackets; at most {BRACKET_DEPTH_N} are allowed; use WITH")
+
+
+def _reason(status: int, message: str) -> str:
+    if status == sandbox.REFUSED:
+        return message
+    if status == sandbox.TOO_LARGE:
+        return (
+            f"the result is larger than {sandbox.RESULT_BYTES_N / 1e9:g} GB; select fewer columns, add a "
+            "LIMIT, or read the Parquet files directly"
+        )
+    return (
+        f"the query's process ended with {status}, most likely for want of memory or stack "
+        f"({sandbox.MEMORY_BYTES_N / 1024**3:g} GiB allowed); simplify it, or filter earlier; "
+        f"its last words: {message.splitlines()[-1] if message else 'none'}"
+    )

@@ -1,0 +1,57 @@
+"""What crosses from one room to another beside Arrow tables."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pyarrow as pa
+from numpy.typing import NDArray
+
+
+@dataclass(frozen=True)
+class PolicySnapshot:
+    """The noise-free policy u = offset + scale * network(observation), ready to act with.
+
+    version     0 for the untrained policy, then the number of learner iterations behind it
+    layers      (weight [n_out, n_in], bias [n_out]) float32 per layer; tanh between layers, none after the last
+    offset_m    rest length that a zero output stands for (m)
+    scale_m     rest length per unit of output (m)
+    """
+
+    version: int
+    layers: tuple[tuple[NDArray[np.float32], NDArray[np.float32]], ...]
+    offset_m: float
+    scale_m: float
+
+
+@dataclass(frozen=True)
+class EpisodePlan:
+    """Everything that an episode's data depends on, apart from the policy and the robot's settings.
+
+    episode_id        unique in its run
+    iteration, index  place of the episode in the run
+    seed              root of the episode's random streams: start, waypoints, exploration
+    steps             control steps T; the episode has T + 1 rows
+    terrain_seed, terrain_difficulty     ground, 0 is flat and 1 the paper's roughness
+    noise_std_m       standard deviation of the exploration noise per cable (m); 0 for an evaluation
+    policy_version    the oldest policy that may act in this episode
+    """
+
+    episode_id: int
+    iteration: int
+    index: int
+    seed: int
+    steps: int
+    terrain_seed: int
+    terrain_difficulty: float
+    noise_std_m: float
+    policy_version: int
+
+
+@dataclass(frozen=True)
+class Episode:
+    """One recorded episode: `frames` with T + 1 rows and `summary` with one row (schemas in `schema`)."""
+
+    frames: pa.Table
+    summary: pa.Table

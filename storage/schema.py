@@ -1,0 +1,190 @@
+"""Arrow schemas of everything a run keeps, with units in the field metadata, and the check at every boundary.
+
+Row t of `frames` holds state t, the action taken at t, and nothing of what followed; the last state of an episode
+(row T) has null actions. Canonical columns are expressed in the symmetry-reduced frame of that row: labels permuted
+by the row's `element`, the world mirrored when the element is improper, and turned about the vertical. The frame
+stays the same while the support triangle stays the same. Columns without the word canonical are world quantities.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+from numpy.typing import NDArray
+
+from t6gps.storage.errors import DataError
+
+SCHEMA_VERSION = 1
+OBSERVATION_N = 47
+"""Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction."""
+
+
+def _scalar(name: str, kind: pa.DataType, unit: str, text: str, nullable: bool = False) -> pa.Field:
+    return pa.field(name, kind, nullable, {"unit": unit, "description": text})
+
+
+def _vector(name: str, length: int, unit: str, text: str, nullable: bool = False) -> pa.Field:
+    metadata = {"unit": unit, "description": text, "length": str(length)}
+    return pa.field(name, pa.list_(pa.float32()), nullable, metadata)
+
+
+def _schema(*fields: pa.Field) -> pa.Schema:
+    return pa.schema(fields, {"t6gps_schema_version": str(SCHEMA_VERSION)})
+
+
+FRAMES = _schema(
+    _scalar("episode_id", pa.int64(), "1", "episode, unique in the run"),
+    _scalar("iteration", pa.int32(), "1", "iteration of the run that sampled the episode"),
+    _scalar("step", pa.int32(), "1", "control step t = 0 .. T, one row each"),
+    _scalar("time_s", pa.float64(), "s", "time since the start of the episode"),
+    _scalar("policy_version", pa.int32(), "1", "version of the policy that acts"),
+    _scalar("com_x_m", pa.float64(), "m", "centre of mass, x"),
+    _scalar("com_y_m", pa.float64(), "m", "centre of mass, y"),
+    _scalar("com_z_m", pa.float64(), "m", "centre of mass, height"),
+    _scalar("speed_m_per_s", pa.float64(), "m/s", "norm of the centre of mass velocity"),
+    _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "centre of mass velocity towards the waypoint"),
+    _scalar("cost", pa.float64(), "m2/s2", "running cost of state t (paper Sec. IV-A)"),
+    _scalar("waypoint", pa.int32(), "1", "number of the active waypoint, counted from 0"),
+    _scalar("waypoint_x_m", pa.float64(), "m", "active waypoint, x"),
+    _scalar("waypoint_y_m", pa.float64(), "m", "active waypoint, y"),
+    _scalar("waypoint_distance_m", pa.float64(), "m", "horizontal distance to the active waypoint"),
+    _scalar("face", pa.int8(), "1", "support triangle under the centre of mass, 0 .. 19"),
+    _scalar("kind", pa.int8(), "1", "kind of the support triangle: 0 Delta, 1 Lambda"),
+    _scalar("entry_edge", pa.int8(), "1", "canonical edge through which the triangle was entered", nullable=True),
+    _scalar(
+        "exit_edge",
+        pa.int8(),
+        "1",
+        "canonical edge through which the triangle is left before the next row; null while it stays",
+        nullable=True,
+    ),
+    _scalar("element", pa.int8(), "1", "symmetry element of the frame, 0 .. 23"),
+    _scalar("frame_yaw_rad", pa.float64(), "rad", "turn about the vertical, after the mirror of the element"),
+    _vector("nodes", 36, "m", "canonical node positions about the centre of mass [12, 3]"),
+    _vector("node_velocities", 36, "m/s", "canonical node velocities about the centre of mass [12, 3]"),
+    _vector("com_velocity", 3, "m/s", "canonical centre of mass velocity"),
+    _vector("target_direction", 2, "1", "canonical horizontal unit vector to the active waypoint"),
+    _vector("rest_lengths", 24, "m", "canonical cable rest lengths"),
+    _vector("observation", OBSERVATION_N, "1", "what the policy sees, scaled to order one"),
+    _vector("action", 24, "m", "canonical commanded rest lengths, noise included", nullable=True),
+    _vector("action_mean", 24, "m", "canonical commanded rest lengths of the noise-free policy", nullable=True),
+    _vector("bar_positions", 18, "m", "bar centres [6, 3]"),
+    _vector("bar_orientations", 24, "1", "bar quaternions x y z w [6, 4]"),
+    _vector("bar_velocities", 18, "m/s", "bar centre velocities [6, 3]"),
+    _vector("bar_angular_velocities", 18, "rad/s", "bar angular velocities [6, 3]"),
+)
+
+EPISODES = _schema(
+    _scalar("episode_id", pa.int64(), "1", "episode, unique in the run"),
+    _scalar("iteration", pa.int32(), "1", "iteration of the run"),
+    _scalar("index", pa.int32(), "1", "place of the episode in its iteration"),
+    _scalar("seed", pa.int64(), "1", "root of the episode's random streams"),
+    _scalar("terrain_seed", pa.int64(), "1", "seed of the ground"),
+    _scalar("terrain_difficulty", pa.float64(), "1", "0 flat, 1 the paper's roughness"),
+    _scalar("policy_version", pa.int32(), "1", "version of the policy that acted"),
+    _scalar("noise_std_m", pa.float64(), "m", "exploration noise per cable"),
+    _scalar("steps", pa.int32(), "1", "control steps taken, T"),
+    _scalar("ended_by", pa.string(), "", "completed, or why the simulation was stopped"),
+    _scalar("cost", pa.float64(), "m2/s2", "mean running cost over rows 1 .. T"),
+    _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "mean forward speed over rows 1 .. T"),
+    _scalar("stuck_share", pa.float64(), "1", "share of rows 1 .. T with a speed below 0.05 m/s"),
+    _scalar("waypoints_reached", pa.int32(), "1", "waypoints reached"),
+    _scalar("path_length_m", pa.float64(), "m", "length of the horizontal path of the centre of mass"),
+    _scalar("transitions", pa.int32(), "1", "changes of the support triangle"),
+    _scalar("bar_mass_kg", pa.float64(), "kg", "mass of a bar in this episode"),
+    _scalar("cable_stiffness_n_per_m", pa.float64(), "N/m", "cable stiffness in this episode"),
+    _scalar("friction", pa.float64(), "1", "coefficient of friction in this episode"),
+    _scalar("winch_speed_m_per_s", pa.float64(), "m/s", "winch speed in this episode"),
+    _scalar("delay_steps", pa.int32(), "1", "control steps from a command to its effect"),
+)
+
+ITERATIONS = _schema(
+    _scalar("iteration", pa.int32(), "1", "iteration, counted from 0"),
+    _scalar("policy_version", pa.int32(), "1", "version of the policy that sampled"),
+    _scalar("episodes", pa.int32(), "1", "episodes sampled"),
+    _scalar("steps", pa.int64(), "1", "control steps sampled"),
+    _scalar("cost", pa.float64(), "m2/s2", "mean over episodes of the running cost"),
+    _scalar("cost_standard_error", pa.float64(), "m2/s2", "standard error over episodes"),
+    _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "mean over episodes"),
+    _scalar("forward_speed_standard_error", pa.float64(), "m/s", "standard error over episodes"),
+    _scalar("stuck_share", pa.float64(), "1", "mean over episodes"),
+    _scalar("waypoints_per_episode", pa.float64(), "1", "mean over episodes"),
+    _scalar("segments", pa.int32(), "1", "segments cut from the episodes"),
+    _scalar("classes", pa.int32(), "1", "segment classes with models of their own"),
+    _scalar("modes", pa.float64(), "1", "mean number of modes per class and time step"),
+    _scalar("residual", pa.float64(), "1", "mean residual of the assigned models in standard deviations"),
+    _scalar("sub_trajectories", pa.int32(), "1", "sub-trajectories of the backward pass"),
+    _scalar("predicted_cost_change", pa.float64(), "m2/s2", "mean predicted change of cost per step"),
+    _scalar("action_change_m", pa.float64(), "m", "root mean square of u* minus the policy mean"),
+    _scalar("supervised_loss", pa.float64(), "1", "final mean squared error of the supervised step"),
+    _scalar("sampling_s", pa.float64(), "s", "duration"),
+    _scalar("segmenting_s", pa.float64(), "s", "duration"),
+    _scalar("fitting_s", pa.float64(), "s", "duration"),
+    _scalar("backward_pass_s", pa.float64(), "s", "duration"),
+    _scalar("supervised_s", pa.float64(), "s", "duration"),
+)
+
+CLASSES = _schema(
+    _scalar("iteration", pa.int32(), "1", "iteration"),
+    _scalar("kind", pa.int8(), "1", "support triangle: 0 Delta, 1 Lambda"),
+    _scalar("entry_edge", pa.int8(), "1", "canonical entry edge, null for a partial segment", nullable=True),
+    _scalar("exit_edge", pa.int8(), "1", "canonical exit edge, null for a partial segment", nullable=True),
+    _scalar("truncated", pa.bool_(), "1", "first part of a long stay"),
+    _scalar("segments", pa.int32(), "1", "segments of the class"),
+    _scalar("rows", pa.int32(), "1", "control steps in these segments"),
+    _scalar("time_steps", pa.int32(), "1", "aligned time steps, T_xi"),
+    _scalar("pooled", pa.bool_(), "1", "too rare for models of its own: uses those pooled over its kind"),
+    _scalar("modes", pa.float64(), "1", "mean number of modes per time step"),
+    _scalar("residual", pa.float64(), "1", "mean residual of the assigned models in standard deviations"),
+)
+
+TABLES = {"frames": FRAMES, "episodes": EPISODES, "iterations": ITERATIONS, "classes": CLASSES}
+
+
+def vector_length(field: pa.Field) -> int | None:
+    """Entries of a vector column, None for a scalar one."""
+    length = (field.metadata or {}).get(b"length")
+    return None if length is None else int(length)
+
+
+def check(table: pa.Table, schema: pa.Schema, where: str) -> pa.Table:
+    """Return `table` when it follows `schema` to the letter.
+
+    `nullable=False` is not enforced by Arrow itself, so nulls, vector lengths and non-finite numbers are checked
+    here. Raises DataError naming `where` and the first column that is missing, unknown, of another type or length,
+    null without permission, or not finite.
+    """
+    if table.schema.names != schema.names:
+        raise DataError(f"{where}: columns must be {schema.names}, found {table.schema.names}")
+    for field in schema:
+        found, column = table.schema.field(field.name).type, table.column(field.name)
+        if found != field.type:
+            raise DataError(f"{where}: column {field.name} must be {field.type}, found {found}")
+        if column.null_count and not field.nullable:
+            raise DataError(f"{where}: column {field.name} must not be null, found {column.null_count} nulls")
+        length = vector_length(field)
+        if length is not None:
+            lengths = pc.list_value_length(column)
+            if not pc.all(pc.equal(lengths, length), min_count=0).as_py():
+                raise DataError(f"{where}: every entry of column {field.name} must hold {length} numbers")
+            column = pc.list_flatten(column)
+            if column.null_count:
+                raise DataError(f"{where}: column {field.name} holds nulls inside its vectors")
+        if pa.types.is_floating(column.type) and not pc.all(pc.is_finite(column), min_count=0).as_py():
+            raise DataError(f"{where}: column {field.name} holds numbers that are not finite")
+    return table
+
+
+def array(table: pa.Table, name: str) -> NDArray[np.generic]:
+    """Column `name` as an array: [rows] for a scalar column, [non-null rows, length] for a vector column.
+
+    A view without a copy when the column is one chunk and, if scalar, has no nulls; nullable integers become
+    float64 with NaN for null.
+    """
+    column = table.column(name)
+    chunk = column.chunk(0) if column.num_chunks == 1 else column.combine_chunks()
+    length = vector_length(FRAMES.field(name)) if pa.types.is_list(column.type) else None
+    flat = chunk if length is None else chunk.flatten()
+    numbers: NDArray[np.generic] = flat.to_numpy(zero_copy_only=False)
+    return numbers if length is None else numbers.reshape(-1, length)

@@ -1,0 +1,96 @@
+"""The durable queue of one iteration's episodes, between their sampling and their commit.
+
+One file per episode: the frames and the summary as two Arrow IPC streams. A file is forced to disk under a
+hidden name and then renamed, so that an episode is there whole or not at all.
+"""
+
+from __future__ import annotations
+
+import logging
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.compute as pc
+
+from t6gps.storage import durable, schema
+from t6gps.storage.errors import DataError
+from t6gps.storage.records import Episode
+
+_log = logging.getLogger(__name__)
+
+
+def checked(episode: Episode, iteration: int) -> Episode:
+    """Return `episode` when both its tables follow their schemas and agree with each other and with
+    `iteration`.
+
+    Raises DataError naming the episode and what disagrees.
+    """
+    if episode.summary.num_rows != 1:
+        raise DataError(f"the summary of an episode must have one row, found {episode.summary.num_rows}")
+    schema.check(episode.summary, schema.EPISODES, "summary of an episode")
+    summary = episode.summary.to_pylist()[0]
+    where = f"episode {summary['episode_id']}"
+    schema.check(episode.frames, schema.FRAMES, f"frames of {where}")
+    if summary["iteration"] != iteration:
+        raise DataError(f"{where}: belongs to iteration {summary['iteration']}, expected {iteration}")
+    if episode.frames.num_rows != summary["steps"] + 1:
+        raise DataError(
+            f"{where}: an episode of {summary['steps']} steps has {summary['steps'] + 1} frames, "
+            f"found {episode.frames.num_rows}"
+        )
+    for name in ("episode_id", "iteration"):
+        if not pc.all(pc.equal(episode.frames.column(name), summary[name])).as_py():
+            raise DataError(f"{where}: every frame must have {name} {summary[name]}, as its summary has")
+    return episode
+
+
+class Spool:
+    """Episodes of one iteration that were acknowledged and are not committed yet.
+
+    torn    files that the last call of `episodes` could not read; their episodes must be sampled again
+    """
+
+    def __init__(self, folder: Path, iteration: int) -> None:
+        self.iteration = iteration
+        self.torn = 0
+        self._root = folder
+        self._folder = folder / f"iteration-{iteration:06d}"
+        self._folder.mkdir(parents=True, exist_ok=True)
+        durable.sync(folder)
+
+    def append(self, episode: Episode) -> None:
+        """Keep `episode`; once this returns, it survives a crash. The same episode again replaces its file.
+
+        Raises DataError when a table breaks its schema or belongs to another iteration.
+        """
+        checked(episode, self.iteration)
+        path = self._folder / f"episode-{episode.summary.column('episode_id')[0].as_py():012d}.arrow"
+        with durable.hidden(path).open("wb") as file:
+            for table in (episode.frames, episode.summary):
+                with pa.ipc.new_stream(file, table.schema) as stream:
+                    stream.write_table(table)
+        durable.publish(path)
+
+    def episodes(self) -> dict[int, Episode]:
+        """Every whole episode by its number; files that cannot be read are logged and counted in `torn`."""
+        whole: dict[int, Episode] = {}
+        self.torn = 0
+        for path in sorted(self._folder.glob("episode-*.arrow")):
+            try:
+                source = pa.BufferReader(path.read_bytes())
+                frames, summary = (pa.ipc.open_stream(source).read_all() for _ in range(2))
+                episode = checked(Episode(frames, summary), self.iteration)
+            except (pa.ArrowException, OSError, DataError) as error:
+                self.torn += 1
+                _log.warning("%s is torn and will be sampled again: %s", path, error)
+                continue
+            whole[summary.column("episode_id")[0].as_py()] = episode
+        return whole
+
+    def clear(self) -> None:
+        """Forget the episodes of this iteration, and of earlier ones whose clearing was cut off."""
+        for folder in sorted(self._root.glob("iteration-*")):
+            if folder.name <= self._folder.name:
+                durable.discard(folder)
+        self._folder.mkdir()
+        durable.sync(self._root)

@@ -1,0 +1,86 @@
+"""What every room's tests share: one thread per library, and synthetic episodes that follow the schemas."""
+
+from __future__ import annotations
+
+import t6gps.service  # noqa: F401 - first: it sets what must be set before numpy and ray are loaded
+
+# isort: split
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from t6gps.storage import schema
+from t6gps.storage.records import Episode
+
+
+def _column(field: pa.Field, rows: int, rng: np.random.Generator) -> pa.Array:
+    """Random values of a field; any bit pattern of a finite float may appear, also -0.0 and denormals."""
+    length = schema.vector_length(field)
+    size = rows * (length or 1)
+    leaf = field.type.value_type if length else field.type
+    if pa.types.is_floating(leaf):
+        dtype = leaf.to_pandas_dtype()
+        numbers = rng.normal(size=size).astype(dtype)
+        special = np.array([-0.0, 0.0, np.finfo(dtype).smallest_subnormal, -np.finfo(dtype).max], dtype)
+        chosen = rng.random(size) < 0.1
+        numbers[chosen] = rng.choice(special, chosen.sum())
+        flat = pa.array(numbers, leaf)
+    elif pa.types.is_string(leaf):
+        flat = pa.array(["completed"] * size, leaf)
+    else:
+        flat = pa.array(rng.integers(0, 20, size), leaf)
+    if length is None:
+        return pa.array([*flat.to_pylist()[:-1], None], leaf) if field.nullable else flat
+    ends = np.arange(rows + 1) * length
+    if field.nullable:  # actions: null in the last row
+        ends[-1] = ends[-2]
+        return pa.ListArray.from_arrays(ends, flat, field.type, mask=pa.array(np.arange(rows) == rows - 1))
+    return pa.ListArray.from_arrays(ends, flat, field.type)
+
+
+def _table(definition: pa.Schema, rows: int, given: dict[str, Any], rng: np.random.Generator) -> pa.Table:
+    columns = [
+        pa.array(np.broadcast_to(given[field.name], rows), field.type)
+        if field.name in given
+        else _column(field, rows, rng)
+        for field in definition
+    ]
+    return pa.Table.from_arrays(columns, schema=definition)
+
+
+def _make_episode(episode_id: int, iteration: int, steps: int = 5, rng: np.random.Generator | None = None) -> Episode:
+    rng = rng or np.random.default_rng([episode_id, iteration])
+    identity: dict[str, Any] = {
+        "episode_id": episode_id,
+        "iteration": iteration,
+        "policy_version": iteration,
+    }
+    frames = _table(schema.FRAMES, steps + 1, {**identity, "step": np.arange(steps + 1)}, rng)
+    summary = _table(schema.EPISODES, 1, {**identity, "steps": steps, "index": episode_id % 100}, rng)
+    return Episode(
+        schema.check(frames, schema.FRAMES, "synthetic frames"),
+        schema.check(summary, schema.EPISODES, "synthetic summary"),
+    )
+
+
+@pytest.fixture
+def make_episode() -> Callable[..., Episode]:
+    """A factory of random episodes: make_episode(episode_id, iteration, steps=5, rng=None)."""
+    return _make_episode
+
+
+@pytest.fixture(scope="session")
+def wait_until() -> Callable[..., None]:
+    """wait_until(condition, seconds) returns as soon as `condition()` holds and fails when it still does not then."""
+
+    def wait(condition: Callable[[], bool], seconds: float) -> None:
+        deadline = time.monotonic() + seconds
+        while not condition():
+            assert time.monotonic() < deadline, f"still not so after {seconds} s"
+            time.sleep(0.02)  # other processes bring the condition about: there is nothing to wait on but the clock
+
+    return wait

@@ -1,0 +1,63 @@
+"""Contract: the compiled observer and its definition in Python are the same."""
+
+import numpy as np
+import pytest
+
+from t6gps.workers import observer
+from t6gps.workers.observation import observe
+from t6gps.workers.physics import Simulation
+from t6gps.workers.settings import RobotSettings
+from t6gps.workers.start import random_start
+from t6gps.workers.state import RobotState
+from t6gps.workers.support import SupportFrame, enter, support_face
+from t6gps.workers.symmetry import frame_yaw
+
+
+@pytest.fixture(scope="module")
+def states() -> list[RobotState]:
+    """States of random motion from several starts: all faces and elements come up."""
+    robot, rng = RobotSettings(winch_speed_m_per_s=1.5, shortest_command_m=0.5), np.random.default_rng(0)
+    found = []
+    with Simulation(robot) as simulation:
+        for _ in range(12):
+            random_start(simulation, robot, None, rng)
+            found += [simulation.control_step(rng.uniform(0.5, 1.35, 24)) for _ in range(60)]
+    return found
+
+
+def test_survey_finds_the_support_face_and_the_centre_of_mass(states: list[RobotState]) -> None:
+    faces = set()
+    for state in states:
+        face, *com = observer.survey(state)
+        assert face == support_face(state.nodes(), state.com)
+        assert np.allclose(com, state.com, rtol=0, atol=1e-14)
+        faces.add(face)
+    assert len(faces) > 15
+
+
+def test_observations_and_turns_are_those_of_the_definition(states: list[RobotState]) -> None:
+    elements, frame = set(), None
+    for number, state in enumerate(states):
+        nodes, com = state.nodes(), state.com
+        face = support_face(nodes, com)
+        frame = enter(face, frame if number % 3 else None, nodes, com)
+        target = (0.6, -0.8)
+        yaw, observation = observer.observe(state, frame, target, 1.088)
+        expected = frame_yaw(nodes, face, frame.element)
+        assert abs(yaw - expected) < 1e-13
+        assert np.allclose(observation, observe(state, frame, expected, np.array(target), 1.088), rtol=1e-6, atol=1e-7)
+        elements.add(frame.element)
+    assert len(elements) > 15
+
+
+def test_what_does_not_fit_is_refused(states: list[RobotState]) -> None:
+    state = states[0]
+    short = RobotState(state.bar_positions[:5], *(getattr(state, n) for n in list(RobotState.__annotations__)[1:]))
+    single = RobotState(
+        state.bar_positions.astype(np.float32), *(getattr(state, n) for n in list(RobotState.__annotations__)[1:])
+    )
+    for bad in (short, single):
+        with pytest.raises(ValueError, match=r"expected float64 \[6, 3\]"):
+            observer.survey(bad)
+    with pytest.raises(ValueError, match="out of range"):
+        observer.observe(state, SupportFrame(20, 0, 0, None), (1.0, 0.0), 1.088)

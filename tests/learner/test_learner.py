@@ -1,0 +1,226 @@
+"""Laws of one iteration: surrogate models in place, order, determinism, restoring, and improvement."""
+
+from __future__ import annotations
+
+import pickle
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pytest
+
+from t6gps.learner import surrogate
+from t6gps.learner.features import NONE, Rows
+from t6gps.learner.learner import Learner
+from t6gps.learner.modes import FitOptions
+from t6gps.learner.segments import cut, group
+from t6gps.learner.settings import LearnerSettings
+from t6gps.storage import schema
+from t6gps.storage.errors import CheckpointError, DataError, RunError
+from t6gps.storage.records import PolicySnapshot
+
+OPTIONS = FitOptions(modes=4, residual_threshold=1.0, prior_samples=100.0, ridge=1e-3)
+Iterate = Callable[[Learner, list[pa.Table]], None]
+
+
+def weights(snapshot: PolicySnapshot) -> bytes:
+    return b"".join(part.tobytes() for layer in snapshot.layers for part in layer)
+
+
+@pytest.fixture(scope="module")
+def jobs(rows: Rows) -> dict[int, surrogate.ClassJob]:
+    segments = cut(rows, 20)
+    return surrogate.jobs(rows, segments, group(segments, 10), OPTIONS, run_seed=1, iteration=0)
+
+
+def test_every_dynamics_sample_lies_in_exactly_one_bin(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
+    taken = np.concatenate([job.rows for job in jobs.values()])
+    assert np.array_equal(np.sort(taken), np.flatnonzero(rows.continues))
+    for job in jobs.values():
+        assert job.step.min() >= 0 and job.step.max() < job.steps
+
+
+def test_crossings_are_alone_in_their_bins(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
+    for job in jobs.values():
+        crossing = rows.exit[job.rows] != NONE
+        assert np.array_equal(crossing, (job.step == job.steps - 1) & job.crosses)
+
+
+def test_the_models_of_a_row_lead_to_the_next_row(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
+    fits = [surrogate.fit_class(job) for job in jobs.values()]
+    patch = surrogate.patch(list(jobs.values()), fits, len(rows.acts))
+    assert np.array_equal(patch.of_row != NONE, rows.continues)
+    index = np.flatnonzero(rows.continues)
+    F, f = patch.models.F[patch.of_row[index]], patch.models.f[patch.of_row[index]]
+    z = np.hstack([rows.state, rows.action])[index]
+    error = (F @ z[:, :, None])[:, :, 0] + f - rows.state[index + 1]
+    spread = rows.state[index + 1].std(axis=0)
+    assert np.sqrt((error**2).mean(axis=0)).max() < 0.5 * spread.max()
+    assert np.nanmean(patch.residual) < 0.4
+
+
+def test_fits_give_identical_bytes_in_any_order_and_after_pickling(jobs: dict[int, surrogate.ClassJob]) -> None:
+    forward = {number: surrogate.fit_class(job) for number, job in jobs.items()}
+    for number in reversed(jobs):
+        again = surrogate.fit_class(pickle.loads(pickle.dumps(jobs[number])))
+        assert pickle.dumps(again) == pickle.dumps(forward[number])
+
+
+def test_seeds_of_all_jobs_differ_and_change_with_run_and_iteration(rows: Rows) -> None:
+    segments = cut(rows, 20)
+    groups = group(segments, 10)
+    seen = {
+        (job.entropy, job.branch)
+        for run_seed, iteration in ((1, 0), (2, 0), (1, 1))
+        for job in surrogate.jobs(rows, segments, groups, OPTIONS, run_seed, iteration).values()
+    }
+    assert len(seen) == 3 * len(groups)
+
+
+def test_the_order_of_arrival_and_of_fitting_does_not_matter(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    def backwards(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
+        return iter([function(item) for item in reversed(items)][::-1])
+
+    one, other = make_learner(), make_learner(fit_map=backwards)
+    iterate(one, tables)
+    iterate(other, tables[::-1])
+    assert weights(one.snapshot) == weights(other.snapshot)
+    assert one.report() == other.report()
+
+
+def test_a_restored_learner_goes_on_with_identical_bytes(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    whole = make_learner()
+    iterate(whole, tables[:8])
+    manifest, arrays = whole.state()
+    manifest, arrays = dict(manifest), {name: array.copy() for name, array in arrays.items()}
+    restored = make_learner()
+    restored.restore(manifest, arrays)
+    for learner in (whole, restored):
+        iterate(learner, tables[4:])
+    assert whole.snapshot.version == restored.snapshot.version == 2
+    assert weights(whole.snapshot) == weights(restored.snapshot)
+    assert whole.report() == restored.report()
+
+
+def test_a_checkpoint_that_does_not_fit_is_refused(make_learner: Callable[..., Learner]) -> None:
+    manifest, arrays = make_learner().state()
+    with pytest.raises(CheckpointError, match="hidden_layers"):
+        make_learner(hidden_layers=(17,)).restore(manifest, arrays)
+    with pytest.raises(CheckpointError, match="layer_0_bias"):
+        make_learner().restore(manifest, {name: a for name, a in arrays.items() if name != "layer_0_bias"})
+
+
+def test_phases_out_of_order_and_repeated_episodes_are_refused(
+    tables: list[pa.Table], make_learner: Callable[..., Learner]
+) -> None:
+    learner = make_learner()
+    with pytest.raises(DataError, match="no episodes"):
+        list(learner.segment())
+    with pytest.raises(RunError, match="segment"):
+        list(learner.fit())
+    learner.add(tables[0])
+    with pytest.raises(DataError, match="twice"):
+        learner.add(tables[0])
+
+
+def test_the_report_fills_the_columns_of_its_tables(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner = make_learner()
+    iterate(learner, tables)
+    iteration, classes = learner.report()
+    assert set(iteration) <= set(schema.ITERATIONS.names)
+    table = schema.check(pa.Table.from_pylist(classes, schema=schema.CLASSES), schema.CLASSES, "classes")
+    actions = sum(table.num_rows - 1 for table in tables)
+    assert sum(table.column("rows").to_pylist()) == actions
+    assert sum(table.column("segments").to_pylist()) == iteration["segments"]
+    assert iteration["classes"] == table.column("pooled").to_pylist().count(False)
+    assert iteration["predicted_cost_change"] < 0 < iteration["action_change_m"]
+
+
+BASE = {
+    "reduced_state": "com", "longest_segment_steps": 3, "smallest_class_segments": 1000, "residual_threshold": 0.15,
+}  # fmt: skip
+CHANGES = {
+    "reduced_state": "nodes", "longest_segment_steps": 5, "smallest_class_segments": 10, "modes": 1,
+    "residual_threshold": 0.3, "prior_samples": 5.0, "ridge": 0.1, "horizon_steps": 3, "kl_weight": 0.2,
+    "deviation_from": "fitted", "hidden_layers": (8,), "epochs": 1, "batch": 50,
+    "learning_rate": 1e-2,
+}  # fmt: skip
+
+
+def test_every_setting_matters(tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate) -> None:
+    assert {*CHANGES, "replay_iterations"} == set(LearnerSettings.model_fields)
+    results = []
+    for change in [{}, *({name: value} for name, value in CHANGES.items())]:
+        learner = make_learner(**BASE | change)
+        iterate(learner, tables)
+        results.append(weights(learner.snapshot))
+    assert len(set(results)) == len(results)
+
+
+def test_the_cost_counts_states_after_a_step_towards_their_own_targets(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    """The target of an episode's first row leads nowhere; that of the last row is aimed at."""
+    improved = {}
+    for row in (None, 0, -1):
+        learner = make_learner()
+        turned = []
+        for table in tables:
+            target = schema.array(table, "target_direction").copy()
+            if row is not None:
+                target[row] *= -1
+            field = schema.FRAMES.field("target_direction")
+            column = pa.array(list(target), type=field.type)
+            turned.append(table.set_column(schema.FRAMES.get_field_index(field.name), field, column))
+        iterate(learner, turned)
+        improved[row] = learner.state()[1]["replay_0_actions"].tobytes()
+    assert improved[0] == improved[None] != improved[-1]
+
+
+def test_replayed_pairs_matter_from_the_second_iteration_on(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learners = [make_learner(replay_iterations=n) for n in (0, 1)]
+    after = []
+    for batch in (tables[:6], tables[6:]):
+        for learner in learners:
+            iterate(learner, batch)
+        after.append(weights(learners[0].snapshot) == weights(learners[1].snapshot))
+    assert after == [True, False]
+
+
+def test_improved_actions_stay_in_the_command_range(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner = make_learner(kl_weight=1e-3)
+    iterate(learner, tables)
+    actions = learner.state()[1]["replay_0_actions"]
+    assert np.float32(0.65) <= actions.min() and actions.max() <= np.float32(1.35)
+    assert np.isfinite(actions).all()
+
+
+def test_hidden_layers_may_come_as_a_list() -> None:
+    assert LearnerSettings(hidden_layers=[64, 64]).hidden_layers == (64, 64)  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize("deviation_from", ["recorded", "fitted"])
+def test_iterations_turn_noise_into_motion_towards_the_target(
+    world: Any, make_learner: Callable[..., Learner], iterate: Iterate, deviation_from: str
+) -> None:
+    learner = make_learner(hidden_layers=(64,), epochs=8, batch=128, deviation_from=deviation_from)
+    speeds = []
+    for iteration in range(3):
+        tables = world.episodes(learner.snapshot, 20, 80, seed=iteration)
+        speeds.append(
+            np.mean([np.sum(schema.array(t, "com_velocity")[:, :2] * schema.array(t, "target_direction"), axis=1)
+                     for t in tables])
+        )  # fmt: skip
+        iterate(learner, tables)
+    assert abs(speeds[0]) < 0.05 and speeds[1] > 0.15 and speeds[2] > speeds[1] + 0.1

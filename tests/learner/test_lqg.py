@@ -1,0 +1,160 @@
+"""Laws of the backward pass."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from t6gps.learner import cost, lqg
+from t6gps.learner.features import Rows
+from t6gps.learner.modes import Models
+
+NX, NU, T, B, C = 5, 3, 6, 4, 0.05
+Array = NDArray[np.float64]
+
+
+@dataclass
+class Problem:
+    """B random sub-trajectories of T steps; each step has a model of its own."""
+
+    models: Models
+    index: NDArray[np.int64]
+    gradient: Array
+    hessian: Array
+    deviation: Array
+
+    def solve(self) -> lqg.Improvement:
+        return lqg.backward_pass(lqg.prepare(self.models, C), self.index, self.gradient, self.hessian, self.deviation)
+
+    def objective(self, b: int, actions: Array) -> tuple[float, float]:
+        """Change of the running cost and value of the KL term under du = actions [T, nu], by model rollout."""
+        dx, change, kl = np.zeros(NX), 0.0, 0.0
+        for t in range(T):
+            m = self.index[b, t]
+            gap = self.deviation[b, t] + actions[t] - self.models.P[m] @ dx
+            kl += C / 2 * gap @ (gap / self.models.variance[m])
+            dx = self.models.F[m] @ np.concatenate([dx, actions[t]])
+            change += self.gradient[b, t] @ dx + dx @ self.hessian @ dx / 2
+        return change, kl
+
+    def closed_loop(self, b: int, improved: lqg.Improvement) -> Array:
+        """Actions of the improved policy from the recorded first state on [T, nu]."""
+        dx, actions = np.zeros(NX), []
+        for t in range(T):
+            actions.append(improved.k[b, t] + improved.K[b, t] @ dx)
+            dx = self.models.F[self.index[b, t]] @ np.concatenate([dx, actions[t]])
+        return np.array(actions)
+
+
+def problem(seed: int = 0, deviation: float = 0.1, policy: float = 0.3) -> Problem:
+    rng = np.random.default_rng(seed)
+    n = B * T
+    F = rng.normal(0, 0.4, (n, NX, NX + NU))
+    P, variance = rng.normal(0, policy, (n, NU, NX)), rng.uniform(0.01, 0.05, (n, NU))
+    models = Models(F, np.zeros((n, NX)), P, np.zeros((n, NU)), variance)
+    state, target = rng.normal(0, 1, (B, T, NX)), rng.normal(size=(B, T, 2))
+    target /= np.linalg.norm(target, axis=2, keepdims=True)
+    return Problem(
+        models,
+        rng.permutation(n).reshape(B, T),
+        cost.gradient(state, target, 0.8, 0.1),
+        cost.hessian(NX, 0.1),
+        rng.normal(0, deviation, (B, T, NU)),
+    )
+
+
+def test_gains_equal_those_of_the_finite_horizon_riccati_equation() -> None:
+    """Without a policy slope and deviation the KL term is an action cost R = c S^-1."""
+    case = problem(deviation=0.0, policy=0.0)
+    improved = case.solve()
+    for b in range(B):
+        M = case.hessian
+        for t in reversed(range(T)):
+            m = case.index[b, t]
+            A, D = case.models.F[m][:, :NX], case.models.F[m][:, NX:]
+            R = np.diag(C / case.models.variance[m])
+            gain = np.linalg.inv(R + D.T @ M @ D) @ (D.T @ M @ A)
+            np.testing.assert_allclose(improved.K[b, t], -gain, rtol=1e-3, atol=1e-4)
+            M = case.hessian + A.T @ M @ A - A.T @ M @ D @ gain
+
+
+def test_the_improved_policy_is_stationary_for_cost_and_kl_together() -> None:
+    case = problem()
+    improved = case.solve()
+    for b in range(B):
+        actions = case.closed_loop(b, improved)
+        size = abs(sum(case.objective(b, np.zeros((T, NU)))))
+        for t, j in np.ndindex(T, NU):
+            step = np.zeros((T, NU))
+            step[t, j] = 1e-3
+            slope = (sum(case.objective(b, actions + step)) - sum(case.objective(b, actions - step))) / 2e-3
+            assert abs(slope) < 2e-3 * size
+
+
+def test_every_other_choice_of_actions_is_worse() -> None:
+    case, rng = problem(), np.random.default_rng(1)
+    improved = case.solve()
+    for b in range(B):
+        actions = case.closed_loop(b, improved)
+        best = sum(case.objective(b, actions))
+        for _ in range(20):
+            assert sum(case.objective(b, actions + 0.05 * rng.normal(size=(T, NU)))) > best
+
+
+def test_improved_actions_lower_the_predicted_cost_of_noise_free_trajectories() -> None:
+    case = problem(deviation=0.0)
+    improved = case.solve()
+    assert (improved.predicted_cost_change < 0).all()
+    for b in range(B):
+        change, _ = case.objective(b, case.closed_loop(b, improved))
+        assert change == pytest.approx(improved.predicted_cost_change[b], rel=1e-3)
+
+
+def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> None:
+    case = problem(deviation=0.2)
+    improved = case.solve()
+    for b in range(B):
+        change, _ = case.objective(b, case.closed_loop(b, improved))
+        assert change == pytest.approx(improved.predicted_cost_change[b], rel=1e-3, abs=1e-4)
+
+
+def test_a_heavy_kl_term_returns_the_policy_mean() -> None:
+    case = problem()
+    models = lqg.prepare(case.models, 1e4)
+    improved = lqg.backward_pass(models, case.index, case.gradient, case.hessian, case.deviation)
+    np.testing.assert_allclose(improved.k, -case.deviation, atol=1e-3)
+
+
+def test_sub_trajectories_do_not_influence_each_other() -> None:
+    case = problem()
+    together = case.solve()
+    for b in range(B):
+        one = slice(b, b + 1)
+        alone = lqg.backward_pass(
+            lqg.prepare(case.models, C), case.index[one], case.gradient[one], case.hessian, case.deviation[one]
+        )
+        np.testing.assert_allclose(alone.k, together.k[one], rtol=1e-5)
+
+
+def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
+    models = problem().models
+    np.testing.assert_allclose(lqg.prepare(models, C, 0.04).precision, C / 0.04)
+    np.testing.assert_allclose(lqg.prepare(models, C, 0.0).precision, C / 1e-4)
+
+
+@pytest.mark.parametrize("horizon", [1, 7, 10, 1000])
+def test_sub_trajectories_cover_every_transition_once_and_never_span_a_gap(rows: Rows, horizon: int) -> None:
+    pieces = lqg.sub_trajectories(rows.continues, horizon)
+    covered = np.zeros(len(rows.continues), dtype=int)
+    for length, starts in pieces.items():
+        assert 1 <= length <= horizon
+        for start in starts:
+            covered[start : start + length] += 1
+            begins_run = start == 0 or not rows.continues[start - 1]
+            assert begins_run or rows.continues[start - 1]
+            ends_run = not rows.continues[start + length]
+            assert length == horizon or ends_run
+    assert np.array_equal(covered, rows.continues.astype(int))

@@ -1,0 +1,98 @@
+"""Laws of the configuration: presets load, overrides reach their key, and everything else is refused by name."""
+
+from pathlib import Path
+
+import pytest
+
+from t6gps.service import config as configuration
+from t6gps.service.config import Config, differences, load, parse, presets
+from t6gps.storage.errors import ConfigError
+
+
+def test_the_presets_of_the_paper_have_its_sizes() -> None:
+    assert presets() == ["flat", "flat-hardware", "flat-quick", "flat-soft", "flat-stiff", "rough", "rough-quick"]
+    rough, flat = load("rough"), load("flat")
+    assert (rough.run.episodes, rough.run.steps, rough.run.iterations) == (300, 250, 5)
+    assert rough.terrain.difficulty == 1.0
+    assert flat.run.episodes * flat.run.steps * flat.run.iterations == 125_000
+    assert flat.terrain.difficulty == 0.0
+
+
+def test_a_kept_configuration_is_read_back_unchanged() -> None:
+    config = load("rough-quick", ["run.seed=3", "learner.reduced_state=nodes+vels"])
+    assert parse(config.to_json()) == config
+
+
+@pytest.mark.parametrize(
+    ("override", "section", "key", "value"),
+    [
+        ("run.seed=12", "run", "seed", 12),
+        ("robot.friction=0.7", "robot", "friction", 0.7),
+        ("robot.bar_mass_kg=5", "robot", "bar_mass_kg", 5.0),
+        ("learner.reduced_state=com", "learner", "reduced_state", "com"),
+        ('learner.reduced_state="com"', "learner", "reduced_state", "com"),
+        ("learner.hidden_layers=[8, 8]", "learner", "hidden_layers", (8, 8)),
+    ],
+)
+def test_an_override_reaches_its_key(override: str, section: str, key: str, value: object) -> None:
+    assert getattr(getattr(load("flat-quick", [override]), section), key) == value
+
+
+@pytest.mark.parametrize(
+    ("override", "words"),
+    [
+        ("run.sed=1", ["unknown key run.sed", "did you mean run.seed", "run.iterations"]),
+        ("rnu.seed=1", ["unknown key rnu", "robot"]),
+        ("run.seed=-1", ["run.seed", "greater than or equal to 0", "-1"]),
+        ("run.seed=abc", ["run.seed", "integer", "abc"]),
+        ("run.episodes=1.5", ["run.episodes", "1.5"]),
+        ("robot.friction=true", ["robot.friction", "number", "True"]),
+        ("robot.friction=nan", ["robot.friction", "nan"]),
+        ("terrain.difficulty=2", ["terrain.difficulty", "less than or equal to 1", "2"]),
+        ("learner.reduced_state=knees", ["learner.reduced_state", "nodes+vels", "knees"]),
+        ("run.seed", ["--set takes key=value", "run.seed"]),
+        ("run.seed.deep=1", ["run.seed"]),
+    ],
+)
+def test_a_bad_override_is_refused_with_its_key_what_was_found_and_what_is_allowed(
+    override: str, words: list[str]
+) -> None:
+    with pytest.raises(ConfigError) as error:
+        load("flat-quick", [override])
+    for word in words:
+        assert word in str(error.value)
+
+
+def test_commands_must_be_ordered() -> None:
+    with pytest.raises(ConfigError, match="shortest_command_m must be below longest_command_m"):
+        load("flat-quick", ["robot.shortest_command_m=1.0", "robot.longest_command_m=0.9"])
+
+
+def test_an_unknown_preset_names_the_nearest_and_all_others() -> None:
+    with pytest.raises(ConfigError, match=r"unknown preset 'flat-quik' \(did you mean flat-quick\?\).*rough-quick"):
+        load("flat-quik")
+
+
+def test_a_file_is_read_and_a_broken_one_refused(tmp_path: Path) -> None:
+    good, broken = tmp_path / "good.toml", tmp_path / "broken.toml"
+    good.write_text("[run]\nepisodes = 7\n")
+    broken.write_text("[run\n")
+    assert load(str(good)).run.episodes == 7
+    with pytest.raises(ConfigError, match="is not TOML"):
+        load(str(broken))
+    with pytest.raises(ConfigError, match="cannot read"):
+        load(str(tmp_path / "missing.toml"))
+
+
+def test_every_setting_says_what_it_is() -> None:
+    for section in Config.model_fields.values():
+        assert section.annotation is not None
+        for name, field in section.annotation.model_fields.items():
+            assert field.description, name
+
+
+def test_differences_name_the_key_and_both_values_and_ignore_the_number_of_workers() -> None:
+    a = load("flat-quick")
+    b = load("flat-quick", ["run.workers=7", "learner.kl_weight=0.5"])
+    assert differences(a, b) == [f"learner.kl_weight = 0.5 (the run has {a.learner.kl_weight})"]
+    assert configuration.differences(a, a) == []

@@ -1,0 +1,75 @@
+"""Laws of the processes that a run starts: they listen to this machine alone, and their death is one clear sentence."""
+
+import os
+import signal
+import subprocess
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import pytest
+
+TRAIN = [
+    sys.executable, "-m", "t6gps.service.cli", "train", "flat-quick", "--run", "watched", "--workers", "1",
+    "--set=run.episodes=200", "--set=run.iterations=1",
+]  # fmt: skip
+LISTENING, LOOPBACK = "0A", ("0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000")
+
+
+def descendants(root: int) -> dict[int, str]:
+    """Command lines of a process and all that it started, by process id."""
+    parents, commands = {}, {}
+    for folder in Path("/proc").glob("[0-9]*"):
+        try:
+            stat = (folder / "stat").read_text()
+            commands[int(folder.name)] = (folder / "cmdline").read_bytes().replace(b"\0", b" ").decode()
+        except OSError:
+            continue  # it has ended meanwhile
+        parents[int(folder.name)] = int(stat.rpartition(")")[2].split()[1])
+    found = {root}
+    while more := {pid for pid, parent in parents.items() if parent in found} - found:
+        found |= more
+    return {pid: commands[pid] for pid in found if pid in commands}
+
+
+def listeners(pids: dict[int, str]) -> set[str]:
+    """Addresses (hexadecimal) on which the processes listen."""
+    sockets = set()
+    for pid in pids:
+        for entry in Path(f"/proc/{pid}/fd").glob("*"):
+            try:
+                sockets.add(str(entry.readlink()))
+            except OSError:
+                continue
+    addresses = set()
+    for table in ("tcp", "tcp6"):
+        for line in Path(f"/proc/net/{table}").read_text().splitlines()[1:]:
+            fields = line.split()
+            if fields[3] == LISTENING and f"socket:[{fields[9]}]" in sockets:
+                addresses.add(fields[1].partition(":")[0])
+    return addresses
+
+
+@pytest.mark.slow
+def test_a_run_listens_on_loopback_alone_and_says_so_when_a_worker_dies(
+    tmp_path: Path, wait_until: Callable[..., None]
+) -> None:
+    started = subprocess.Popen([*TRAIN, "--root", str(tmp_path)], stderr=subprocess.PIPE, start_new_session=True)
+    try:
+        spooled = "watched/spool/*/episode-*.arrow"
+        wait_until(lambda: started.poll() is not None or len(list(tmp_path.glob(spooled))) >= 2, 120)
+        assert started.poll() is None
+        family = descendants(started.pid)
+        assert listeners(family)
+        assert listeners(family) <= set(LOOPBACK)
+        worker = next(pid for pid, command in family.items() if command.startswith("ray::WorkerActor"))
+        os.kill(worker, signal.SIGKILL)
+        _, message = started.communicate(timeout=60)
+    finally:
+        started.kill()
+    assert started.returncode == 2
+    assert message.count(b"error: ") == 1
+    assert b"a process of the run died" in message
+    assert b"--resume" in message
+    assert b"Traceback" not in message
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 30)

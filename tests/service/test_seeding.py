@@ -1,0 +1,32 @@
+"""Laws of the random streams."""
+
+from t6gps.service.config import load
+from t6gps.service.seeding import evaluation_plans, training_plans
+
+
+def test_plans_depend_on_configuration_and_iteration_alone() -> None:
+    a, b = load("flat-quick"), load("flat-quick", ["run.workers=9"])
+    assert training_plans(a, 2) == training_plans(b, 2)
+
+
+def test_no_two_episodes_share_a_seed_or_an_id() -> None:
+    config = load("flat-quick")
+    plans = [plan for iteration in range(5) for plan in training_plans(config, iteration)]
+    unseen = evaluation_plans(config, 300, seed=config.run.seed, terrain_seed=None, version=5)
+    seeds = [plan.seed for plan in plans + unseen] + [plan.terrain_seed for plan in plans + unseen]
+    assert len(set(seeds)) == len(seeds)
+    assert [plan.episode_id for plan in plans] == list(range(len(plans)))
+
+
+def test_a_smaller_iteration_is_the_beginning_of_a_larger_one() -> None:
+    small, large = (load("flat-quick", [f"run.episodes={n}"]) for n in (5, 9))
+    assert [p.seed for p in training_plans(small, 1)] == [p.seed for p in training_plans(large, 1)][:5]
+
+
+def test_the_terrain_seed_of_an_evaluation_changes_the_ground_alone() -> None:
+    config = load("rough-quick")
+    a = evaluation_plans(config, 4, seed=1, terrain_seed=None, version=0)
+    b = evaluation_plans(config, 4, seed=1, terrain_seed=2, version=0)
+    assert [p.seed for p in a] == [p.seed for p in b]
+    assert not {p.terrain_seed for p in a} & {p.terrain_seed for p in b}
+    assert all(p.noise_std_m == 0 for p in a + b)

@@ -1,0 +1,178 @@
+from __future__ import annotations
+
+import subprocess
+import sys
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from t6gps.storage import catalog, sandbox, schema, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import QueryError
+from t6gps.storage.query import query
+
+
+@pytest.fixture(scope="module")
+def empty(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    return catalog.create(tmp_path_factory.mktemp("runs"), "empty", "{}")
+
+
+def test_a_query_sees_what_was_committed(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    commit(run, 1)
+    episodes = tables.read(run, "episodes")
+    found = query(
+        run,
+        "WITH late AS (SELECT * FROM frames WHERE iteration = 1) "
+        "SELECT e.episode_id, e.cost, count(*) AS n, any_value(l.nodes) AS nodes FROM late l JOIN episodes e "
+        "USING (episode_id) GROUP BY ALL ORDER BY e.episode_id",
+    )
+    assert found.column("episode_id").to_pylist() == [100, 101, 102]
+    assert found.column("cost").to_pylist() == episodes.column("cost").to_pylist()[3:]
+    assert found.column("n").to_pylist() == [6, 6, 6]
+    assert np.shape(found.column("nodes").to_pylist()) == (3, 36)
+
+
+def test_a_query_does_not_see_a_commit_that_was_cut_off(run: Run, commit: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    commit(run, 0)
+    real = tables._commit
+    with monkeypatch.context() as patch:
+        patch.setattr(tables, "_commit", lambda *given: given[1] == "episodes" or real(*given))
+        commit(run, 1)
+    assert query(run, "SELECT max(iteration) AS last FROM frames").to_pylist() == [{"last": 0}]
+
+
+def test_a_run_without_iterations_has_empty_tables_with_every_column(empty: Run) -> None:
+    counts = ", ".join(f"(SELECT count(*) FROM {name}) AS {name}" for name in schema.TABLES)
+    assert query(empty, f"SELECT {counts};").to_pylist() == [dict.fromkeys(schema.TABLES, 0)]
+    listed = query(empty, "SHOW ALL TABLES").to_pylist()
+    assert {row["name"]: row["column_names"] for row in listed} == {
+        name: definition.names for name, definition in schema.TABLES.items()
+    }
+    assert query(empty, "DESCRIBE frames").column("column_name").to_pylist() == schema.FRAMES.names
+
+
+@pytest.mark.parametrize(
+    ("sql", "sentence"),
+    [
+        ("SELECT speed FROM frames", 'Binder Error: Referenced column "speed" not found'),
+        ("SELECT * FROM frame", "Catalog Error: Table with name frame does not exist"),
+    ],
+)
+def test_an_unknown_name_is_answered_with_the_tables_and_their_columns(empty: Run, sql: str, sentence: str) -> None:
+    with pytest.raises(QueryError) as caught:
+        query(empty, sql)
+    assert str(caught.value).splitlines()[0].startswith(sentence)
+    for name, definition in schema.TABLES.items():
+        assert f"{name}: {', '.join(definition.names)}" in str(caught.value)
+
+
+@pytest.mark.parametrize(
+    ("sql", "reason"),
+    [
+        ("COPY (SELECT 1) TO '{file}'", "found COPY"),
+        ("EXPORT DATABASE '{file}'", "found EXPORT"),
+        ("ATTACH '{file}'", "found ATTACH"),
+        ("SET threads = 9", "found SET"),
+        ("INSTALL httpfs", "found LOAD"),
+        ("PRAGMA database_list", "found PRAGMA"),
+        ("CALL pragma_version()", "found CALL"),
+        ("CREATE TABLE t AS SELECT 1", "found CREATE"),
+        ("WITH a AS (SELECT 1) INSERT INTO frames SELECT * FROM a", "found INSERT"),
+        ("SELECT 1; SELECT 2", "found SELECT, SELECT"),
+        ("SELECT 1; COPY (SELECT 1) TO '{file}'", "found SELECT, COPY"),
+        ("-- nothing", "found nothing"),
+        ("SELECT * FROM query('COPY (SELECT 1) TO ''{file}''')", "single SELECT"),
+        ("SELECT * FROM read_csv('/etc/passwd')", "disabled by configuration"),
+        ("SELECT * FROM glob('/*')", "disabled by configuration"),
+        ("SELECT * FROM read_parquet('http://127.0.0.1/x')", "disabled by configuration"),
+        ("SELECT * FROM '/etc/passwd'", "does not exist"),
+        ("SELECT * FROM files", "does not exist"),
+        ("SELEC 1", "syntax error"),
+        ("SELECT 'a'::INT", "Conversion Error"),
+        ("SELECT " + "NOT " * 16000 + "true", "depth limit"),
+    ],
+)
+def test_an_attack_or_a_mistake_is_refused_with_what_is_allowed(
+    empty: Run, tmp_path: Path, sql: str, reason: str
+) -> None:
+    file = tmp_path / "stolen"
+    with pytest.raises(QueryError, match=reason) as caught:
+        query(empty, sql.replace("{file}", str(file)))
+    assert "allowed is one SELECT" in str(caught.value) or "frames: episode_id" in str(caught.value)
+    assert not file.exists()
+
+
+def test_a_query_runs_with_its_bounds_set_and_locked(empty: Run) -> None:
+    expected = {
+        "enable_external_access": "false",
+        "lock_configuration": "true",
+        "memory_limit": "953.6 MiB",
+        "temp_directory": "",
+        "threads": "2",
+    }
+    found = query(empty, f"SELECT name, value FROM duckdb_settings() WHERE name IN {tuple(expected)}")
+    assert {row["name"]: row["value"] for row in found.to_pylist()} == expected
+
+
+def test_length_nesting_and_encoding_are_bounded_before_anything_starts(
+    empty: Run, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    nested = "SELECT " + "(" * 100 + "1" + ")" * 100
+    assert query(empty, nested).num_rows == 1
+    monkeypatch.setattr(sys, "executable", "/nowhere")
+    for sql, reason in (
+        (nested.replace("1", "(1)"), "nests 101 brackets"),
+        ("SELECT '" + "é" * 32768 + "'", "65545 bytes"),
+        ("SELECT '\ud800'", "not valid Unicode"),
+    ):
+        with pytest.raises(QueryError, match=reason):
+            query(empty, sql)
+
+
+@pytest.mark.parametrize(
+    "sql",
+    [
+        "WITH RECURSIVE t(x) AS (SELECT 1 UNION ALL SELECT x + 1 FROM t) SELECT count(*) FROM t",
+        "SELECT sum(sqrt(a.range * b.range)) FROM range(1000000) a, range(1000000) b",
+    ],
+)
+def test_an_endless_query_is_stopped(empty: Run, sql: str) -> None:
+    with pytest.raises(QueryError, match=r"stopped after 1\.5 s.*filter"):
+        query(empty, sql, timeout_s=1.5)
+
+
+def test_memory_is_bounded(empty: Run) -> None:
+    with pytest.raises(QueryError, match=r"(?s)Out of Memory.*filter by iteration") as caught:
+        query(empty, "SELECT list(range) FROM range(300000000)")
+    assert "SET" not in str(caught.value)
+
+
+def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
+    script = "from t6gps.storage import sandbox; sandbox._limit(1.0); print(len(bytes({bytes_n})))"
+    small, large = (
+        subprocess.run(
+            [sys.executable, "-c", script.format(bytes_n=bytes_n)], capture_output=True, text=True, check=False
+        )
+        for bytes_n in (sandbox.MEMORY_BYTES_N // 2, 2 * sandbox.MEMORY_BYTES_N)
+    )
+    assert small.returncode == 0
+    assert "MemoryError" in large.stderr
+
+
+def test_the_result_is_bounded(empty: Run) -> None:
+    with pytest.raises(QueryError, match=r"larger than 1 GB.*LIMIT"):
+        query(empty, "SELECT range, range AS b, range AS c FROM range(50000000)")
+
+
+def test_the_process_that_answers_loads_nothing_heavy() -> None:
+    source = Path(sandbox.__file__).read_text(encoding="utf-8")
+    assert "deltalake" not in source
+    script = (
+        "import sys, t6gps.storage.sandbox\n"
+        "print([name for name in ('torch', 'ray', 'pybullet', 'deltalake', 'pandas') if name in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert found.stdout.strip() == "[]"

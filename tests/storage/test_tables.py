@@ -1,0 +1,209 @@
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+import pytest
+from deltalake import DeltaTable
+
+from t6gps.storage import catalog, parquet, schema, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import DataError, RunError
+from t6gps.storage.records import Episode
+
+
+def _snapshot(run: Run) -> dict[str, bytes]:
+    return {str(path): path.read_bytes() for path in sorted(run.path.rglob("*")) if path.is_file()}
+
+
+def test_what_was_committed_is_what_was_sampled_bit_for_bit(run: Run, commit: Any, bits: Any) -> None:
+    episodes = commit(run, 0) + commit(run, 1)
+    frames = pa.concat_tables([episode.frames for episode in episodes])
+    values = np.concatenate([schema.array(frames, name) for name in ("nodes", "action")], axis=None)
+    assert (np.signbit(values) & (values == 0)).any(), "the data must hold -0.0"
+    assert ((values != 0) & (np.abs(values) < np.finfo(np.float32).tiny)).any(), "the data must hold denormals"
+    assert bits(tables.read(run, "frames")) == bits(frames)
+    summaries = pa.concat_tables([episode.summary for episode in episodes])
+    assert bits(tables.read(run, "episodes")) == bits(summaries)
+
+
+@pytest.mark.parametrize("table", schema.TABLES)
+def test_what_is_read_has_the_schema_to_the_letter(run: Run, commit: Any, table: str) -> None:
+    assert tables.read(run, table).num_rows == 0
+    assert tables.read(run, table).schema.equals(schema.TABLES[table], check_metadata=True)
+    commit(run, 0)
+    found = tables.read(run, table)
+    assert found.num_rows > 0
+    assert found.schema.equals(schema.TABLES[table], check_metadata=True)
+    schema.check(found, schema.TABLES[table], "read")
+
+
+def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, rows: Any) -> None:
+    iteration_row, class_rows = rows
+    commit(run, 0)
+    commit(run, 1)
+    assert tables.read(run, "iterations").to_pylist() == [iteration_row(0), iteration_row(1)]
+    assert tables.read(run, "classes").to_pylist() == class_rows(0) + class_rows(1)
+
+
+def test_columns_and_rows_can_be_chosen(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    commit(run, 1)
+    found = tables.read(run, "frames", ["nodes", "episode_id"], pc.field("iteration") == 1)
+    assert found.column_names == ["nodes", "episode_id"]
+    assert found.column("episode_id").unique().to_pylist() == [100, 101, 102]
+    assert found.schema.field("nodes").metadata[b"unit"] == b"m"
+
+
+def test_one_episode_is_read_whole_and_in_order(run: Run, commit: Any, bits: Any) -> None:
+    episodes = commit(run, 0) + commit(run, 1)
+    assert bits(tables.episode_frames(run, 101)) == bits(episodes[4].frames)
+
+
+def test_unknown_tables_columns_and_episodes_are_answered_with_those_that_exist(run: Run, commit: Any) -> None:
+    with pytest.raises(DataError, match="no iteration is committed"):
+        tables.episode_frames(run, 0)
+    commit(run, 0)
+    with pytest.raises(DataError, match=r"3 episodes lie in 0 \.\. 2"):
+        tables.episode_frames(run, 3)
+    with pytest.raises(DataError, match="no table 'frame'; tables: frames, episodes"):
+        tables.read(run, "frame")
+    with pytest.raises(DataError, match="no column 'speed'; columns: episode_id"):
+        tables.read(run, "frames", ["speed"])
+
+
+def test_committing_twice_changes_nothing(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    commit(run, 1)
+    before = _snapshot(run)
+    commit(run, 0)
+    commit(run, 1)
+    assert _snapshot(run) == before
+
+
+@pytest.mark.parametrize("committed", ["", "frames", "frames classes", "frames classes iterations"])
+@pytest.mark.parametrize("file_written", [False, True])
+def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by_committing_again(
+    run: Run, commit: Any, bits: Any, monkeypatch: pytest.MonkeyPatch, committed: str, file_written: bool
+) -> None:
+    whole = commit(run, 0)
+    done: list[str] = []
+    real = tables._commit
+
+    def crash(run: Run, table: str, iteration: int, groups: list[pa.Table]) -> None:
+        if len(done) == len(committed.split()):
+            if file_written:
+                parquet.write(run.tables / table / f"iteration-{iteration:06d}.parquet", groups)
+            raise KeyboardInterrupt
+        real(run, table, iteration, groups)
+        done.append(table)
+
+    with monkeypatch.context() as patch:
+        patch.setattr(tables, "_commit", crash)
+        with pytest.raises(KeyboardInterrupt):
+            commit(run, 1)
+    assert done == committed.split()
+    assert tables.committed_iterations(run) == 1
+    assert bits(tables.read(run, "frames")) == bits(pa.concat_tables([each.frames for each in whole]))
+    for table in schema.TABLES:
+        assert tables.read(run, table).column("iteration").unique().to_pylist() == [0]
+    with pytest.raises(DataError, match="has no episode 100"):
+        tables.episode_frames(run, 100)
+
+    whole += commit(run, 1)
+    assert tables.committed_iterations(run) == 2
+    assert bits(tables.read(run, "frames")) == bits(pa.concat_tables([each.frames for each in whole]))
+    for table in schema.TABLES:
+        assert set(tables.read(run, table).column("iteration").to_pylist()) == {0, 1}
+
+
+def test_a_cut_off_commit_is_not_completed_with_other_episodes(
+    run: Run, commit: Any, make_episode: Any, rows: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    real = tables._commit
+    with monkeypatch.context() as patch:
+        patch.setattr(tables, "_commit", lambda *given: given[1] == "frames" and real(*given))
+        commit(run, 0)
+    with pytest.raises(DataError, match="holds other episodes"):
+        tables.commit_iteration(run, 0, [make_episode(9, 0)], rows[0](0), rows[1](0))
+    assert tables.committed_iterations(run) == 0
+
+
+def test_iterations_are_committed_in_turn(run: Run, commit: Any) -> None:
+    assert tables.committed_iterations(run) == 0
+    with pytest.raises(RunError, match="next is 0, found 1"):
+        commit(run, 1)
+    commit(run, 0)
+    assert tables.committed_iterations(run) == 1
+
+
+def _bad(good: Episode, row: dict[str, object], classes: list[dict[str, object]]) -> list[tuple[Any, ...]]:
+    cost = good.frames.column_names.index("cost")
+    column = pa.array([float("nan")] * good.frames.num_rows)
+    not_finite = Episode(good.frames.set_column(cost, schema.FRAMES.field(cost), column), good.summary)
+    return [
+        ([], row, classes, "no episodes"),
+        ([good, good], row, classes, "given twice"),
+        ([not_finite], row, classes, "cost holds numbers that are not finite"),
+        ([good], row | {"speed": 1}, classes, "exactly"),
+        ([good], {"iteration": 0}, classes, "exactly"),
+        ([good], row | {"iteration": 1}, classes, "belongs to iteration 1"),
+        ([good], row | {"cost": float("inf")}, classes, "not finite"),
+        ([good], row | {"cost": None}, classes, "must not be null"),
+        ([good], row | {"cost": "cheap"}, classes, "iterations of iteration 0"),
+        ([good], row | {"segments": 2**40}, classes, "iterations of iteration 0"),
+        ([good], row, [classes[0] | {"kind": None}], "must not be null"),
+    ]
+
+
+@pytest.mark.parametrize("case", range(11))
+def test_data_that_break_their_schema_are_refused_and_nothing_is_written(
+    run: Run, make_episode: Any, rows: Any, case: int
+) -> None:
+    episodes, row, classes, reason = _bad(make_episode(1, 0), rows[0](0), rows[1](0))[case]
+    before = _snapshot(run)
+    with pytest.raises(DataError, match=reason):
+        tables.commit_iteration(run, 0, episodes, row, classes)
+    assert _snapshot(run) == before
+
+
+def test_a_file_holds_ten_episodes_a_row_group_and_splits_noisy_floats(run: Run, make_episode: Any, rows: Any) -> None:
+    episodes = [make_episode(index, 0) for index in range(23)]
+    tables.commit_iteration(run, 0, episodes, rows[0](0), [])
+    assert tables.read(run, "classes").num_rows == 0
+    metadata = pq.ParquetFile(run.tables / "frames" / "iteration-000000.parquet").metadata
+    assert [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)] == [60, 60, 18]
+    columns = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
+    encodings = {column.path_in_schema: column.encodings for column in columns}
+    assert {column.compression for column in columns} == {"ZSTD"}
+    for name in ("cost", "nodes.list.element", "action.list.element"):
+        assert "BYTE_STREAM_SPLIT" in encodings[name]
+        assert "RLE_DICTIONARY" not in encodings[name]
+    assert "RLE_DICTIONARY" in encodings["episode_id"]
+
+
+def test_other_readers_of_delta_see_the_same_rows(run: Run, commit: Any) -> None:
+    episodes = commit(run, 0) + commit(run, 1)
+    delta = DeltaTable(str(run.tables / "episodes"))
+    assert delta.to_pyarrow_table().num_rows == len(episodes)
+    actions = pa.table(delta.get_add_actions(flatten=True)).sort_by("path").to_pylist()
+    assert [(action["num_records"], action["min.episode_id"], action["max.episode_id"]) for action in actions] == [
+        (3, 0, 2),
+        (3, 100, 102),
+    ]
+    described = DeltaTable(str(run.tables / "frames")).schema().to_arrow()
+    assert pa.schema(described).field("cost").metadata[b"unit"] == b"m2/s2"
+
+
+def test_a_root_with_blanks_and_accents_works_also_when_relative(
+    tmp_path: Path, commit: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.chdir(tmp_path)
+    run = catalog.create(Path("my rüns #1"), "one", "{}")
+    commit(run, 0)
+    assert tables.read(run, "episodes").num_rows == 3
+    assert tables.episode_frames(run, 1).num_rows == 6

@@ -1,0 +1,68 @@
+"""Laws of the package: what an installed wheel holds is what the repository holds."""
+
+import os
+import subprocess
+import sys
+import sysconfig
+import tomllib
+import zipfile
+from pathlib import Path
+
+import pytest
+
+REPOSITORY = Path(__file__).parents[1]
+SETUPTOOLS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]
+
+
+@pytest.fixture(scope="module")
+def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A wheel built from the files that git tracks or would track, without network."""
+    folder = tmp_path_factory.mktemp("wheel")
+    listed = ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"]
+    for name in subprocess.run(listed, cwd=REPOSITORY, capture_output=True, check=True).stdout.decode().split("\0"):
+        source = REPOSITORY / name
+        if name and source.is_file():
+            copy = folder / "source" / name
+            copy.parent.mkdir(parents=True, exist_ok=True)
+            copy.write_bytes(source.read_bytes())
+    build = [sys.executable, "-m", "build", "--wheel", "--no-isolation", "--outdir", str(folder)]
+    done = subprocess.run([*build, str(folder / "source")], capture_output=True, text=True, check=False)
+    assert done.returncode == 0, done.stdout + done.stderr
+    return next(folder.glob("*.whl"))
+
+
+def test_every_folder_with_modules_is_listed_as_a_package() -> None:
+    rooms = {path.parent.name for path in REPOSITORY.glob("*/__init__.py")}
+    assert {f"t6gps.{room}" for room in rooms} == set(SETUPTOOLS["packages"])
+    assert SETUPTOOLS["package-dir"] == {f"t6gps.{room}": room for room in rooms}
+
+
+@pytest.mark.slow
+def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for room in SETUPTOOLS["package-dir"].values():
+        for module in (REPOSITORY / room).glob("*.py"):
+            assert f"t6gps/{room}/{module.name}" in names
+    for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
+        assert f"t6gps/deploy/presets/{preset.name}" in names
+    for library in ("_stepper", "_observer"):
+        assert f"t6gps/workers/{library}{sysconfig.get_config_var('EXT_SUFFIX')}" in names
+    assert all(name.startswith(("t6gps/", "t6gps-")) for name in names)
+
+
+@pytest.mark.slow
+def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: Path) -> None:
+    zipfile.ZipFile(wheel).extractall(tmp_path / "site")
+    # Without site (-S) the editable installation of this environment is not found; its dependencies still are.
+    path = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
+    arguments = ["--root", str(tmp_path / "runs"), "--serial", "--set=run.episodes=2", "--set=run.iterations=1"]
+    done = subprocess.run(
+        [sys.executable, "-S", "-m", "t6gps.service.cli", "train", "flat-quick", *arguments, "--set=run.steps=20"],
+        env={**os.environ, "PYTHONPATH": path},
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+    assert "Noise-free policy" in done.stdout

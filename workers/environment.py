@@ -1,0 +1,142 @@
+"""The robot and its task as a Gymnasium environment, for any library of reinforcement learning (docs/environment.md).
+
+Importing this module registers `t6gps/SuperBall-v0`.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+try:
+    import gymnasium
+except ModuleNotFoundError as error:
+    if error.name != "gymnasium":
+        raise
+    raise ModuleNotFoundError(
+        "t6gps.workers.environment needs Gymnasium, which is not installed; run: pip install 't6gps[gym]'",
+        name="gymnasium",
+    ) from None
+
+from t6gps.storage.errors import DataError, UnsoundStateError
+from t6gps.storage.schema import OBSERVATION_N
+from t6gps.workers.episode import RunningEpisode
+from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, REST_LENGTH_SCALE_M
+from t6gps.workers.physics import FASTEST_SOUND_M_PER_S, Simulation, nominal_rest_length
+from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
+from t6gps.workers.start import check_stance
+from t6gps.workers.symmetry import CABLE_MAP
+from t6gps.workers.task import running_cost
+from t6gps.workers.topology import BAR_LENGTH_M, CABLES_N
+
+Floats = NDArray[np.float32]
+
+ENVIRONMENT_ID = "t6gps/SuperBall-v0"
+EPISODE_STEPS = 250
+"""Control steps T after which Gymnasium truncates an episode (paper Sec. IV-A)."""
+
+
+def _observation_space(robot: RobotSettings) -> gymnasium.spaces.Box[np.float32]:
+    """The box [47] that no observation leaves; entries and scales are those of `observation`.
+
+    Winches stay within the range of commands. A sound state bounds the root of the summed squares of all velocities,
+    so also the angular velocity of each bar.
+    """
+    high = np.ones(OBSERVATION_N)
+    low = -high
+    low[0] = 0.0
+    nominal_m = nominal_rest_length(robot)
+    low[1:25] = (robot.shortest_command_m - nominal_m) / REST_LENGTH_SCALE_M
+    high[1:25] = (robot.longest_command_m - nominal_m) / REST_LENGTH_SCALE_M
+    high[25:43] = FASTEST_SOUND_M_PER_S / (BAR_LENGTH_M / 2) / ANGULAR_VELOCITY_SCALE_RAD_PER_S
+    low[25:43] = -high[25:43]
+    return gymnasium.spaces.Box(low.astype(np.float32), high.astype(np.float32))
+
+
+class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
+    """SUPERball v2 on its way along random waypoints (paper Sec. IV-A), one control step of 0.1 s per `step`.
+
+    Observations [47] and actions [24] are canonical: as the policy of T6-GPS sees and commands them. Actions -1 and 1
+    stand for the shortest and longest commanded rest length. The reward is minus the running cost of the state
+    reached (m2/s2).
+    """
+
+    def __init__(
+        self,
+        robot: RobotSettings | None = None,
+        task: TaskSettings | None = None,
+        terrain: TerrainSettings | None = None,
+    ) -> None:
+        self._settings = RolloutSettings(
+            robot=robot or RobotSettings(), task=task or TaskSettings(), terrain=terrain or TerrainSettings()
+        )
+        self._middle_m = (self._settings.robot.longest_command_m + self._settings.robot.shortest_command_m) / 2
+        self._half_range_m = (self._settings.robot.longest_command_m - self._settings.robot.shortest_command_m) / 2
+        self.observation_space = _observation_space(self._settings.robot)
+        self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (CABLES_N,))
+        check_stance(self._settings.robot)
+        self._simulation = Simulation(self._settings.robot)
+        self._episode: RunningEpisode | None = None
+
+    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+        """Start an episode. `seed` decides start, course and ground; without it they are drawn.
+
+        The option `terrain_seed` sets the ground apart from the rest, as the plan of a recorded episode does. `info`
+        names both seeds. DataError if there are other options, PhysicsError if the robot cannot start.
+        """
+        super().reset(seed=seed)
+        options = options or {}
+        if options.keys() - {"terrain_seed"}:
+            raise DataError(f"reset takes no options but terrain_seed, found {', '.join(map(str, options))}")
+        if seed is None:
+            seed = int(self.np_random.integers(2**63))
+        terrain_seed = int(options.get("terrain_seed", seed))
+        self._episode = None  # a start that fails leaves none
+        settings = self._settings
+        nominal_m = nominal_rest_length(settings.robot)
+        episode = RunningEpisode(self._simulation, settings, seed, terrain_seed, settings.terrain.difficulty, nominal_m)
+        self._episode = episode
+        return episode.observation, {"seed": seed, "terrain_seed": terrain_seed, **_info(episode)}
+
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+        """Command the rest lengths that `action` [24] stands for during one control step.
+
+        Where the simulation leaves the range of sound states, the episode terminates, `info["ended_by"]` says why,
+        the last sound observation comes again, and the reward is that of standing still for EPISODE_STEPS steps, so
+        that ending early never pays. DataError if the action is not 24 finite numbers.
+        """
+        episode = self._episode
+        if episode is None:
+            raise gymnasium.error.ResetNeeded("the episode is over or has not begun; call reset() before step()")
+        action = np.asarray(action)
+        if action.shape != (CABLES_N,) or not np.isfinite(action).all():
+            raise DataError(f"an action is {CABLES_N} finite numbers from -1 to 1, found {action!r}")
+        # Recorded actions are float32; so are these, and a recorded episode can be repeated to the last bit.
+        canonical = (self._middle_m + self._half_range_m * action.astype(np.float64)).astype(np.float32)
+        try:
+            episode.advance(canonical[CABLE_MAP[episode.frame.element]].astype(np.float64))
+        except UnsoundStateError as error:
+            self._episode = None
+            unsound = -EPISODE_STEPS * self._settings.task.target_speed_m_per_s**2
+            return episode.observation, unsound, True, False, {"ended_by": error.reason, **_info(episode)}
+        reward = -float(running_cost(episode.state.com_velocity, np.array(episode.target), self._settings.task))
+        return episode.observation, reward, False, False, _info(episode)
+
+    def close(self) -> None:
+        """Release the simulator; a second call does nothing."""
+        self._episode = None
+        self._simulation.close()
+
+
+def _info(episode: RunningEpisode) -> dict[str, Any]:
+    return {
+        "forward_speed_m_per_s": float(episode.state.com_velocity[:2] @ np.array(episode.target)),
+        "waypoints_reached": episode.course.reached,
+        "com_m": episode.state.com,
+        "face": episode.frame.face,
+    }
+
+
+gymnasium.register(ENVIRONMENT_ID, f"{__name__}:{SuperBallEnvironment.__name__}", max_episode_steps=EPISODE_STEPS)

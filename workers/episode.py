@@ -1,0 +1,74 @@
+"""An episode in progress: what the recorded rollout and the Gymnasium environment have in common."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import hypot
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.workers.ground import ground
+from t6gps.workers.observer import observe, survey
+from t6gps.workers.physics import CONTROL_STEP_S, Simulation
+from t6gps.workers.settings import RolloutSettings
+from t6gps.workers.start import random_start
+from t6gps.workers.support import SupportFrame, enter
+from t6gps.workers.task import Course, random_waypoints
+
+
+class RunningEpisode:
+    """The robot on its way; it depends on the arguments and the commands alone, whatever the simulation did before.
+
+    state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
+    waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
+    observation               what the policy sees now [47]
+    course                    progress along the waypoints
+    noise_rng                 the stream for exploration; start and course have streams of their own
+
+    Observed rest lengths are centred on `nominal_m`, the policy's own, whatever robot it meets. Commands act
+    `delay_steps` control steps after they are given; until then the winches hold. Raises PhysicsError if the robot
+    cannot even start, TerrainError if there is no such ground.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        settings: RolloutSettings,
+        seed: int,
+        terrain_seed: int,
+        terrain_difficulty: float,
+        nominal_m: float,
+        delay_steps: int = 0,
+    ) -> None:
+        robot, task = settings.robot, settings.task
+        start_rng, course_rng, self.noise_rng = np.random.default_rng(seed).spawn(3)
+        terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
+        simulation.set_ground(terrain)
+        self._simulation = simulation
+        self._nominal_m = nominal_m
+        self._step = 0
+        self.state = random_start(simulation, robot, terrain, start_rng)
+        self.course = Course(random_waypoints(course_rng, self.state.com[:2], task), task)
+        self._delayed = deque([self.state.rest_lengths] * delay_steps)
+        self._look(None)
+
+    def advance(self, command: NDArray[np.float64]) -> None:
+        """Take one control step under commanded rest lengths [24] (m) in world labels.
+
+        UnsoundStateError if it leaves the range of sound states; then everything but the simulation stays as it was.
+        """
+        self._delayed.append(command)
+        self.state = self._simulation.control_step(self._delayed.popleft())
+        self._step += 1
+        self._look(self.frame)
+
+    def _look(self, previous: SupportFrame | None) -> None:
+        face, x, y, _ = survey(self.state)
+        if previous is None or face != previous.face:
+            self.frame = enter(face, previous, self.state.nodes(), self.state.com)
+        self.waypoint = self.course.advance(x, y, self._step * CONTROL_STEP_S)
+        way_x, way_y = self.waypoint[0] - x, self.waypoint[1] - y
+        distance = hypot(way_x, way_y)
+        self.target = (way_x / distance, way_y / distance)
+        self.yaw_rad, self.observation = observe(self.state, self.frame, self.target, self._nominal_m)

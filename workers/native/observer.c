@@ -1,0 +1,207 @@
+/*
+ * What a worker computes between two control steps: nodes, support triangle, frame and observation of a state.
+ *
+ * The same definitions as support.support_face, symmetry.frame_yaw and observation.observe, which are the reference
+ * that this module is tested against. It holds no robot: `bind` takes the tables of topology and symmetry once.
+ */
+#define PY_SSIZE_T_CLEAN
+#include <Python.h>
+#include <math.h>
+#include <string.h>
+
+enum { BARS = 6, NODES = 12, CABLES = 24, FACES = 20, ELEMENTS = 24, OBSERVATION = 47 };
+
+static struct {
+    int64_t faces[FACES][3], kinds[FACES], reference_face[2];
+    int64_t nodes_from[ELEMENTS][NODES], bars_from[ELEMENTS][BARS], cables_from[ELEMENTS][CABLES];
+    int64_t proper[ELEMENTS];
+    double reference_triangles[2][3][2];
+    double bar_length, rest_length_scale, angular_velocity_scale, slowest_track;
+} tables;
+
+/* A view of a buffer of doubles [rows, 3 or 4] or [n], whatever its strides. */
+struct view {
+    Py_buffer buffer;
+    Py_ssize_t row, column;
+};
+
+static double at(const struct view *view, int i, int j) {
+    return *(const double *)((const char *)view->buffer.buf + i * view->row + j * view->column);
+}
+
+static int open_view(PyObject *object, struct view *view, Py_ssize_t rows, Py_ssize_t columns) {
+    if (PyObject_GetBuffer(object, &view->buffer, PyBUF_STRIDED_RO | PyBUF_FORMAT) != 0) return -1;
+    const Py_buffer *b = &view->buffer;
+    const int plain = columns == 1 ? b->ndim == 1 : b->ndim == 2 && b->shape[1] == columns;
+    if (!plain || b->shape[0] != rows || strcmp(b->format, "d") != 0) {
+        PyErr_Format(PyExc_ValueError, "expected float64 [%zd, %zd]", rows, columns);
+        PyBuffer_Release(&view->buffer);
+        return -1;
+    }
+    view->row = b->strides[0];
+    view->column = columns == 1 ? 0 : b->strides[1];
+    return 0;
+}
+
+static void find_nodes(const struct view *positions, const struct view *orientations, double nodes[NODES][3]) {
+    for (int bar = 0; bar < BARS; bar++) {
+        const double x = at(orientations, bar, 0), y = at(orientations, bar, 1);
+        const double z = at(orientations, bar, 2), w = at(orientations, bar, 3);
+        const double arm[3] = {(x * z + w * y) * tables.bar_length, (y * z - w * x) * tables.bar_length,
+                               (0.5 - x * x - y * y) * tables.bar_length};
+        for (int i = 0; i < 3; i++) {
+            nodes[2 * bar][i] = at(positions, bar, i) + arm[i];
+            nodes[2 * bar + 1][i] = at(positions, bar, i) - arm[i];
+        }
+    }
+}
+
+static void mean_row(const struct view *rows, double mean[3]) {
+    for (int i = 0; i < 3; i++) {
+        mean[i] = 0;
+        for (int bar = 0; bar < BARS; bar++) mean[i] += at(rows, bar, i);
+        mean[i] /= BARS;
+    }
+}
+
+static int support_face(double nodes[NODES][3], const double com[3]) {
+    int lowest = -1, lowest_mean = 0;
+    double height = com[2], least_sum = INFINITY;
+    for (int face = 0; face < FACES; face++) {
+        double x[3], y[3], z[3], area[3];
+        for (int corner = 0; corner < 3; corner++) {
+            const double *node = nodes[tables.faces[face][corner]];
+            x[corner] = node[0] - com[0], y[corner] = node[1] - com[1], z[corner] = node[2];
+        }
+        for (int corner = 0; corner < 3; corner++) {
+            const int a = (corner + 1) % 3, b = (corner + 2) % 3;
+            area[corner] = x[a] * y[b] - x[b] * y[a];
+        }
+        const double sum = z[0] + z[1] + z[2];
+        if (sum < least_sum) least_sum = sum, lowest_mean = face;
+        const int left = area[0] >= 0 && area[1] >= 0 && area[2] >= 0;
+        const int right = area[0] <= 0 && area[1] <= 0 && area[2] <= 0;
+        if (!left && !right) continue;
+        const double below = (area[0] * z[0] + area[1] * z[1] + area[2] * z[2]) / (area[0] + area[1] + area[2]);
+        if (below < height) height = below, lowest = face;
+    }
+    return lowest < 0 ? lowest_mean : lowest;
+}
+
+static double frame_yaw(double nodes[NODES][3], int face, int element) {
+    const int64_t kind = tables.kinds[face];
+    const int64_t *reference = tables.faces[tables.reference_face[kind]];
+    const double side = tables.proper[element] ? 1.0 : -1.0;
+    double x[3], y[3], mean_x = 0, mean_y = 0, twist = 0, along = 0;
+    for (int corner = 0; corner < 3; corner++) {
+        const double *node = nodes[tables.nodes_from[element][reference[corner]]];
+        x[corner] = node[0], y[corner] = node[1];
+        mean_x += node[0] / 3, mean_y += node[1] / 3;
+    }
+    for (int corner = 0; corner < 3; corner++) {
+        const double *goal = tables.reference_triangles[kind][corner];
+        const double dx = x[corner] - mean_x, dy = side * (y[corner] - mean_y);
+        twist += dx * goal[1] - dy * goal[0];
+        along += dx * goal[0] + dy * goal[1];
+    }
+    return atan2(twist, along);
+}
+
+/* survey(positions [6, 3], orientations [6, 4]) -> (face, com x, com y, com z) */
+static PyObject *survey(PyObject *self, PyObject *const *arguments, Py_ssize_t n) {
+    (void)self;
+    struct view positions, orientations;
+    if (n != 2) return PyErr_Format(PyExc_TypeError, "survey takes 2 arguments");
+    if (open_view(arguments[0], &positions, BARS, 3) != 0) return NULL;
+    if (open_view(arguments[1], &orientations, BARS, 4) != 0) {
+        PyBuffer_Release(&positions.buffer);
+        return NULL;
+    }
+    double nodes[NODES][3], com[3];
+    find_nodes(&positions, &orientations, nodes);
+    mean_row(&positions, com);
+    PyBuffer_Release(&positions.buffer);
+    PyBuffer_Release(&orientations.buffer);
+    return Py_BuildValue("iddd", support_face(nodes, com), com[0], com[1], com[2]);
+}
+
+static void put_direction(float *out, double yaw, double side, double x, double y) {
+    out[0] = (float)(cos(yaw) * x - sin(yaw) * side * y);
+    out[1] = (float)(sin(yaw) * x + cos(yaw) * side * y);
+}
+
+/*
+ * observe(positions, orientations, velocities [6, 3], angular velocities [6, 3], rest lengths [24], face, element,
+ *         target x, target y, nominal rest length, out: writable float32 [47]) -> yaw
+ */
+static PyObject *observe(PyObject *self, PyObject *arguments) {
+    (void)self;
+    PyObject *objects[5], *out_object;
+    int face, element;
+    double target[2], nominal;
+    if (!PyArg_ParseTuple(arguments, "OOOOOiidddO", &objects[0], &objects[1], &objects[2], &objects[3], &objects[4],
+                          &face, &element, &target[0], &target[1], &nominal, &out_object))
+        return NULL;
+    static const Py_ssize_t rows[5] = {BARS, BARS, BARS, BARS, CABLES}, columns[5] = {3, 4, 3, 3, 1};
+    struct view views[5];
+    Py_buffer out_buffer;
+    PyObject *result = NULL;
+    int opened = 0;
+    while (opened < 5 && open_view(objects[opened], &views[opened], rows[opened], columns[opened]) == 0) opened++;
+    if (opened < 5 || PyObject_GetBuffer(out_object, &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) != 0) goto release;
+    const int fits = out_buffer.len == OBSERVATION * (Py_ssize_t)sizeof(float) && strcmp(out_buffer.format, "f") == 0;
+    if (!fits || face < 0 || face >= FACES || element < 0 || element >= ELEMENTS) {
+        PyErr_SetString(PyExc_ValueError, "observe: face, element or output out of range");
+    } else {
+        double nodes[NODES][3], velocity[3];
+        find_nodes(&views[0], &views[1], nodes);
+        mean_row(&views[2], velocity);
+        const double yaw = frame_yaw(nodes, face, element), side = tables.proper[element] ? 1.0 : -1.0;
+        const double c = cos(yaw), s = sin(yaw);
+        float *out = out_buffer.buf;
+        out[0] = (float)tables.kinds[face];
+        for (int cable = 0; cable < CABLES; cable++)
+            out[1 + cable] =
+                (float)((at(&views[4], (int)tables.cables_from[element][cable], 0) - nominal) / tables.rest_length_scale);
+        for (int bar = 0; bar < BARS; bar++) { /* a mirror maps the pseudo-vector by det(W) W */
+            const int from = (int)tables.bars_from[element][bar];
+            const double x = at(&views[3], from, 0) / tables.angular_velocity_scale;
+            const double y = at(&views[3], from, 1) / tables.angular_velocity_scale;
+            const double z = at(&views[3], from, 2) / tables.angular_velocity_scale;
+            out[25 + 3 * bar] = (float)(side * c * x - s * y);
+            out[26 + 3 * bar] = (float)(side * s * x + c * y);
+            out[27 + 3 * bar] = (float)(side * z);
+        }
+        const double speed = fmax(hypot(velocity[0], velocity[1]), tables.slowest_track);
+        put_direction(out + 43, yaw, side, target[0], target[1]);
+        put_direction(out + 45, yaw, side, velocity[0] / speed, velocity[1] / speed);
+        result = PyFloat_FromDouble(yaw);
+    }
+    PyBuffer_Release(&out_buffer);
+release:
+    while (opened > 0) PyBuffer_Release(&views[--opened].buffer);
+    return result;
+}
+
+/* bind(bytes of the tables in the order of the struct) */
+static PyObject *bind(PyObject *self, PyObject *bytes) {
+    (void)self;
+    char *source;
+    Py_ssize_t length;
+    if (PyBytes_AsStringAndSize(bytes, &source, &length) != 0) return NULL;
+    if (length != (Py_ssize_t)sizeof tables)
+        return PyErr_Format(PyExc_ValueError, "expected %zd bytes of tables, got %zd", (Py_ssize_t)sizeof tables, length);
+    memcpy(&tables, source, sizeof tables);
+    Py_RETURN_NONE;
+}
+
+static PyMethodDef methods[] = {
+    {"bind", bind, METH_O, "Take the tables of topology and symmetry."},
+    {"survey", (PyCFunction)(void (*)(void))survey, METH_FASTCALL, "Support face and centre of mass of a state."},
+    {"observe", observe, METH_VARARGS, "Write the observation of a state; returns the turn of its frame."},
+    {NULL, NULL, 0, NULL},
+};
+
+static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_observer", NULL, -1, methods, NULL, NULL, NULL, NULL};
+
+PyMODINIT_FUNC PyInit__observer(void) { return PyModule_Create(&module); }

@@ -1,0 +1,58 @@
+"""The binding of workers/native/observer.c: what a worker computes between two control steps, at compiled speed.
+
+`support.support_face`, `symmetry.frame_yaw` and `observation.observe` define the same in Python; a contract test holds
+both equal.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.storage.schema import OBSERVATION_N
+from t6gps.workers import _observer
+from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, REST_LENGTH_SCALE_M, SLOWEST_TRACK_M_PER_S
+from t6gps.workers.state import RobotState
+from t6gps.workers.support import SupportFrame
+from t6gps.workers.symmetry import (
+    BARS_FROM,
+    CABLES_FROM,
+    NODES_FROM,
+    PROPER,
+    REFERENCE_FACE,
+    REFERENCE_TRIANGLES_M,
+)
+from t6gps.workers.topology import BAR_LENGTH_M, FACE_KINDS, FACES
+
+_LABELS = (FACES, FACE_KINDS, REFERENCE_FACE, NODES_FROM, BARS_FROM, CABLES_FROM, PROPER)
+_SCALES = (BAR_LENGTH_M, REST_LENGTH_SCALE_M, ANGULAR_VELOCITY_SCALE_RAD_PER_S, SLOWEST_TRACK_M_PER_S)
+_observer.bind(
+    b"".join(np.ascontiguousarray(table, dtype=np.int64).tobytes() for table in _LABELS)
+    + REFERENCE_TRIANGLES_M.tobytes()
+    + np.array(_SCALES).tobytes()
+)
+
+
+def survey(state: RobotState) -> tuple[int, float, float, float]:
+    """Support face (as `support.support_face`) and centre of mass x, y, z (m) of a state."""
+    return _observer.survey(state.bar_positions, state.bar_orientations)
+
+
+def observe(
+    state: RobotState, frame: SupportFrame, target: tuple[float, float], nominal_m: float
+) -> tuple[float, NDArray[np.float32]]:
+    """Turn of the frame (as `symmetry.frame_yaw`, rad) and observation [47] (as `observation.observe`) of a state."""
+    observation = np.empty(OBSERVATION_N, dtype=np.float32)
+    yaw = _observer.observe(
+        state.bar_positions,
+        state.bar_orientations,
+        state.bar_velocities,
+        state.bar_angular_velocities,
+        state.rest_lengths,
+        frame.face,
+        frame.element,
+        *target,
+        nominal_m,
+        observation,
+    )
+    return yaw, observation

@@ -1,0 +1,71 @@
+"""One episode, as a loop without side effects: plan and policy in, tables out (paper Alg. 2, RunSamples)."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.storage.errors import PhysicsError, UnsoundStateError
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.workers import exploration, policy
+from t6gps.workers.episode import RunningEpisode
+from t6gps.workers.physics import Simulation
+from t6gps.workers.recording import Outcome, Record, to_episode
+from t6gps.workers.settings import RolloutSettings
+from t6gps.workers.support import SupportFrame
+from t6gps.workers.symmetry import CABLE_MAP
+
+
+def rollout(
+    simulation: Simulation,
+    settings: RolloutSettings,
+    plan: EpisodePlan,
+    snapshot: PolicySnapshot,
+    delay_steps: int = 0,
+) -> Episode:
+    """Run the episode that `plan` describes with the policy `snapshot` plus exploration noise.
+
+    The result depends on the arguments alone, whatever the simulation did before. An episode that leaves the ground
+    or the range of sound states ends there and says why in `ended_by`; PhysicsError if it does so at once.
+    """
+    episode = RunningEpisode(
+        simulation, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, snapshot.offset_m, delay_steps
+    )
+    noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation)
+    shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
+
+    record = Record()
+    _keep(record, episode)
+    ended_by = "completed"
+    for _ in range(plan.steps):
+        frame = episode.frame
+        mean = policy.act(snapshot, episode.observation)
+        mean = np.minimum(np.maximum(mean, shortest_m), longest_m)
+        command = np.minimum(np.maximum(mean[CABLE_MAP[frame.element]] + next(noise), shortest_m), longest_m)
+        try:
+            episode.advance(command)
+        except UnsoundStateError as error:
+            if not record.actions:
+                raise PhysicsError(f"episode {plan.episode_id}, seed {plan.seed}, step 0: {error}") from error
+            # The unsound state is not recorded, so the action that led to it is not either.
+            ended_by = error.reason
+            break
+        record.means.append(mean)
+        record.actions.append(_canonical_action(command, frame))
+        _keep(record, episode)
+    outcome = Outcome(snapshot.version, ended_by, episode.course.reached, delay_steps)
+    return to_episode(record, plan, outcome, settings)
+
+
+def _keep(record: Record, episode: RunningEpisode) -> None:
+    record.states.append(episode.state)
+    record.frames.append(episode.frame)
+    record.yaws_rad.append(episode.yaw_rad)
+    record.waypoints.append((episode.course.active, *episode.waypoint))
+    record.observations.append(episode.observation)
+
+
+def _canonical_action(command: NDArray[np.float64], frame: SupportFrame) -> NDArray[np.float64]:
+    action = np.empty_like(command)
+    action[CABLE_MAP[frame.element]] = command
+    return action

@@ -1,0 +1,83 @@
+"""Settings of the robot, its ground and its task. Defaults are SUPERball v2 with the paper's scenario."""
+
+from pydantic import Field, model_validator
+
+from t6gps.storage.settings import Settings
+
+
+class RobotSettings(Settings):
+    """Physical parameters of the robot and of its simulation (SI units; sources in docs/physics.md)."""
+
+    bar_mass_kg: float = Field(6.0, ge=1.0, le=20.0, description="mass of one bar (kg)")
+    bar_radius_m: float = Field(0.05, ge=0.01, le=0.1, description="collision radius of a bar (m)")
+    axial_inertia_kg_m2: float = Field(0.06, ge=0.01, le=1.0, description="inertia of a bar about its axis")
+    axial_damping_n_m_s: float = Field(0.3, ge=0.0, le=5.0, description="torque against spin about the axis per rad/s")
+    cable_stiffness_n_per_m: float = Field(2000.0, ge=500.0, le=5000.0, description="cable stiffness (N/m)")
+    cable_damping_n_s_per_m: float = Field(50.0, ge=0.0, le=500.0, description="damping, clipped at the elastic force")
+    cable_max_tension_n: float = Field(1500.0, ge=200.0, le=10000.0, description="largest tension (N)")
+    pretension_n: float = Field(200.0, ge=50.0, le=1000.0, description="tension at the neutral shape (N)")
+    winch_speed_m_per_s: float = Field(0.35, ge=0.01, le=2.0, description="largest rate of change of a rest length")
+    shortest_command_m: float = Field(0.5, ge=0.4, le=1.2, description="lower end of commanded rest lengths (m)")
+    longest_command_m: float = Field(1.5, ge=0.8, le=1.6, description="upper end of commanded rest lengths (m)")
+    friction: float = Field(1.0, ge=0.05, le=1.5, description="effective coefficient between bars and ground")
+    physics_step_s: float = Field(0.004, ge=0.0005, le=0.01, description="physics step; divides the control step (s)")
+
+    @model_validator(mode="after")
+    def _ordered_commands(self) -> "RobotSettings":
+        if self.shortest_command_m >= self.longest_command_m:
+            raise ValueError("shortest_command_m must be below longest_command_m")
+        return self
+
+
+class TerrainSettings(Settings):
+    """Ground of an episode."""
+
+    difficulty: float = Field(0.0, ge=0.0, le=1.0, description="0 flat, 1 the paper's 38 deg / 16 deg / 1.55 m")
+    tilt_deg: float = Field(0.0, ge=0.0, le=35.0, description="slope of the whole ground, rising towards +x (deg)")
+    size_m: float = Field(40.0, ge=34.0, le=100.0, description="width of the ground; the plane has no end (m)")
+    file: str = Field("", description="height map (.npy, .png) or surface (.stl, .obj) in place of random hills")
+    png_range_m: float = Field(1.55, gt=0.0, le=20.0, description="height between black and white of a .png (m)")
+
+
+class TaskSettings(Settings):
+    """Waypoints and cost (paper Sec. IV-A)."""
+
+    waypoints: int = Field(5, ge=1, le=100, description="random waypoints of an episode, visited in a circle")
+    nearest_waypoint_m: float = Field(2.0, gt=0.0, le=20.0, description="least distance between waypoints (m)")
+    farthest_waypoint_m: float = Field(4.0, gt=0.0, le=20.0, description="largest distance between waypoints (m)")
+    waypoint_timeout_s: float = Field(5.0, gt=0.0, le=1000.0, description="the next waypoint comes after this time (s)")
+    target_speed_m_per_s: float = Field(0.8, gt=0.0, le=5.0, description="v* of the cost (m/s)")
+    vertical_weight: float = Field(0.1, gt=0.0, le=1.0, description="weight of the vertical velocity in the cost")
+
+    @model_validator(mode="after")
+    def _ordered_distances(self) -> "TaskSettings":
+        if self.nearest_waypoint_m > self.farthest_waypoint_m:
+            raise ValueError("nearest_waypoint_m must not exceed farthest_waypoint_m")
+        return self
+
+
+class ExplorationSettings(Settings):
+    """Exploration noise added to the policy's commands."""
+
+    noise_std_m: float = Field(0.15, ge=0.0, le=1.0, description="standard deviation per cable (m)")
+    noise_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="first-order correlation from step to step")
+
+
+class RandomisationSettings(Settings):
+    """Domain randomisation: how far the robots of single episodes spread around the configured one."""
+
+    mass_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the bars' mass")
+    stiffness_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the cables' stiffness")
+    friction_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the friction")
+    winch_speed_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the winch speed")
+    largest_delay_steps: int = Field(0, ge=0, le=10, description="largest delay of commands (control steps)")
+
+
+class RolloutSettings(Settings):
+    """Everything a worker needs to know before its first plan."""
+
+    robot: RobotSettings = RobotSettings()
+    terrain: TerrainSettings = TerrainSettings()
+    task: TaskSettings = TaskSettings()
+    exploration: ExplorationSettings = ExplorationSettings()
+    randomisation: RandomisationSettings = RandomisationSettings()

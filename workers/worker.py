@@ -1,0 +1,48 @@
+"""A rollout worker: owns one simulated robot and runs plans."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.schema import OBSERVATION_N
+from t6gps.workers import policy
+from t6gps.workers.physics import Simulation
+from t6gps.workers.randomisation import draw
+from t6gps.workers.rollout import rollout
+from t6gps.workers.settings import RobotSettings, RolloutSettings
+from t6gps.workers.topology import CABLES_N
+
+RANDOMISATION_STREAM = 3
+"""Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
+
+
+class RolloutWorker:
+    """Runs episodes one after the other; each depends on its plan and policy alone.
+
+    `simulation` makes the simulator: PyBullet, or another engine with the same interface.
+    """
+
+    def __init__(
+        self, settings: RolloutSettings, simulation: Callable[[RobotSettings], Simulation] = Simulation
+    ) -> None:
+        self._settings = settings
+        self._make_simulation = simulation
+        self._simulation = simulation(settings.robot)
+
+    def run(self, plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
+        """Run one episode. DataError if the policy does not fit the robot, PhysicsError if the start is unsound."""
+        policy.check(snapshot, OBSERVATION_N, CABLES_N)
+        rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(RANDOMISATION_STREAM,)))
+        robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
+        if robot != self._simulation.robot:
+            self._simulation.close()
+            self._simulation = self._make_simulation(robot)
+        settings = self._settings.model_copy(update={"robot": robot})
+        return rollout(self._simulation, settings, plan, snapshot, delay_steps)
+
+    def close(self) -> None:
+        """Release the simulator."""
+        self._simulation.close()
