@@ -15,6 +15,7 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.workers.bullet import pybullet
+from t6gps.workers.contacts import cull_triangles
 from t6gps.workers.plugin import PluginStepper
 from t6gps.workers.reference import ReferenceStepper, read_state
 from t6gps.workers.settings import RobotSettings
@@ -29,9 +30,6 @@ STEPPER_VARIABLE = "T6GPS_PHYSICS"
 FASTEST_SOUND_M_PER_S = 60.0
 _DEEPEST_SOUND_M = 0.3
 _PARKING_HEIGHT_M = 1000.0
-# A capsule is tested against every triangle that its bounding box meets; the boxes of two halves meet fewer.
-# Together the halves have the surface of the whole.
-_PIECES_ON_A_MESH = 2
 
 
 class _Stepper(Protocol):
@@ -90,6 +88,7 @@ class Simulation:
         self.robot = robot
         self.bodies: list[int] = []
         self._terrain: Terrain | None = None
+        cull_triangles()
         self.client = pybullet.connect(pybullet.DIRECT)
         if self.client < 0:
             raise PhysicsError("PyBullet cannot open another client; close simulations that are no longer used")
@@ -154,14 +153,8 @@ class Simulation:
 
     def _add_bar(self) -> int:
         client, robot = self.client, self.robot
-        pieces_n = 1 if self._terrain is None else _PIECES_ON_A_MESH
-        piece_m = BAR_LENGTH_M / pieces_n
-        shape = pybullet.createCollisionShapeArray(
-            shapeTypes=[pybullet.GEOM_CAPSULE] * pieces_n,
-            radii=[robot.bar_radius_m] * pieces_n,
-            lengths=[piece_m] * pieces_n,
-            collisionFramePositions=[[0.0, 0.0, (i + 0.5) * piece_m - BAR_LENGTH_M / 2] for i in range(pieces_n)],
-            physicsClientId=client,
+        shape = pybullet.createCollisionShape(
+            pybullet.GEOM_CAPSULE, radius=robot.bar_radius_m, height=BAR_LENGTH_M, physicsClientId=client
         )
         bar: int = pybullet.createMultiBody(robot.bar_mass_kg, shape, physicsClientId=client)
         transverse_inertia = robot.bar_mass_kg * BAR_LENGTH_M**2 / 12

@@ -249,22 +249,6 @@ def test_no_bar_sinks_into_or_passes_through_the_roughest_ground() -> None:
     assert min(lowest) > 0.8 * robot.bar_radius_m
 
 
-def test_two_halves_of_a_bar_move_like_a_whole_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    """Only a contact at the middle of a bar, which both halves find, moves it differently: by millimetres."""
-    with Simulation(ROBOT) as halves, monkeypatch.context() as patch:
-        halves.set_ground(ROUGH)
-        patch.setattr(physics, "_PIECES_ON_A_MESH", 1)
-        with Simulation(ROBOT) as whole:
-            whole.set_ground(ROUGH)
-            differences = []
-            commands = _commands(120, 5)
-            for number, state in enumerate(_run(whole, neutral_state(ROBOT, 1.9), commands)[10::5]):
-                one, two = (_run(simulation, state, commands[number : number + 1])[0] for simulation in (whole, halves))
-                differences.append(np.abs(one.nodes() - two.nodes()).max())
-    assert np.median(differences) < 1e-6
-    assert max(differences) < 5e-3
-
-
 def test_winches_move_at_their_speed_and_stop_at_the_clipped_command(flat: Simulation) -> None:
     flat.reset(neutral_state(ROBOT, 50.0))
     command = np.full(CABLES_N, 9.0)
@@ -354,6 +338,7 @@ def test_a_missing_plugin_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_library_without_bullets_functions_is_refused_with_their_name(monkeypatch: pytest.MonkeyPatch) -> None:
+    physics.cull_triangles()  # before the library changes its name
     monkeypatch.setattr(pybullet, "__file__", str(plugin.library_path()))
     with pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand"):
         Simulation(ROBOT, "plugin")

@@ -16,6 +16,8 @@
 
 enum { BARS = 6, NODES = 12, CABLES = 24, MISSING_NAME = 64 };
 enum { BULLET_API_VERSION = 202010061, WORLD_FRAME = 2, BASE = -1 };
+enum { POSE_SIZE = 7 * sizeof(double), VELOCITY_SIZE = 6 * sizeof(double) };
+enum { MOST_DOUBLES = 2 << 20 }; /* the client's memory is 8 MB and a little */
 enum result { DONE = 0, NOT_BOUND, OTHER_LAYOUT, NO_LIBRARY, NO_SYMBOL, NO_MEMORY, REFUSED };
 
 typedef void *client_handle, *command_handle, *status_handle;
@@ -52,6 +54,7 @@ struct bullet {
     void (*b3ApplyExternalTorque)(command_handle, int body, int link, const double *torque, int flag);
     int (*b3SubmitClientCommand)(client_handle, command_handle);
     status_handle (*b3ProcessServerStatus)(client_handle);
+    int (*b3GetStatusType)(status_handle);
     int (*b3GetStatusActualState)(status_handle, int *body, int *q_n, int *u_n, const double **frame, const double **q,
                                   const double **u, const double **reactions);
 };
@@ -59,6 +62,9 @@ struct bullet {
 struct stepper {
     struct bullet bullet;
     struct block *block;
+    status_handle status;   /* the client's only one */
+    int state_type;         /* its type after a state was read */
+    const double *q, *u;    /* where Bullet writes states, NULL while unknown */
 };
 
 static int resolve(struct bullet *bullet, const char *library_path, char *missing) {
@@ -77,6 +83,7 @@ static int resolve(struct bullet *bullet, const char *library_path, char *missin
     RESOLVE(b3ApplyExternalTorque)
     RESOLVE(b3SubmitClientCommand)
     RESOLVE(b3ProcessServerStatus)
+    RESOLVE(b3GetStatusType)
     RESOLVE(b3GetStatusActualState)
 #undef RESOLVE
     dlclose(library);
@@ -89,16 +96,44 @@ static status_handle submit(const struct bullet *bullet, client_handle client, c
     return bullet->b3ProcessServerStatus(client);
 }
 
-static int read_bars(const struct bullet *bullet, client_handle client, struct block *block) {
-    for (int bar = 0; bar < BARS; bar++) {
-        const double *q, *u;
-        status_handle status =
-            submit(bullet, client, bullet->b3RequestActualStateCommandInit(client, block->bodies[bar]));
+static void find_original(struct stepper *stepper, const double *q, const double *u) {
+    const double *end = q - (u - q);
+    for (const double *at = stepper->status; at < end && q - at < MOST_DOUBLES; at++)
+        if (at[0] == q[0] && !memcmp(at, q, POSE_SIZE) && !memcmp(at + (u - q), u, VELOCITY_SIZE)) {
+            stepper->q = at;
+            stepper->u = at + (u - q);
+            return;
+        }
+}
+
+/*
+ * Reads a bar. Through its interface Bullet hands out a copy of what it wrote, 30 kB for every state, whatever the body
+ * has. The original precedes the copy in the client's memory: it is looked for once, and read from then on.
+ */
+static int read_bar(struct stepper *stepper, client_handle client, int bar) {
+    const struct bullet *bullet = &stepper->bullet;
+    struct block *block = stepper->block;
+    command_handle command = bullet->b3RequestActualStateCommandInit(client, block->bodies[bar]);
+    const double *q = stepper->q, *u = stepper->u;
+    if (q) {
+        bullet->b3SubmitClientCommand(client, command);
+        if (bullet->b3GetStatusType(stepper->status) != stepper->state_type) return REFUSED;
+    } else {
+        status_handle status = submit(bullet, client, command);
         if (!status || !bullet->b3GetStatusActualState(status, NULL, NULL, NULL, NULL, &q, &u, NULL)) return REFUSED;
-        memcpy(block->bars[bar], q, 7 * sizeof(double));
-        memcpy(block->bars[bar] + 7, u, 6 * sizeof(double));
+        stepper->status = status;
+        stepper->state_type = bullet->b3GetStatusType(status);
+        find_original(stepper, q, u);
     }
+    memcpy(block->bars[bar], q, POSE_SIZE);
+    memcpy(block->bars[bar] + 7, u, VELOCITY_SIZE);
     return DONE;
+}
+
+static int read_bars(struct stepper *stepper, client_handle client) {
+    int result = DONE;
+    for (int bar = 0; bar < BARS && result == DONE; bar++) result = read_bar(stepper, client, bar);
+    return result;
 }
 
 static void cross(const double *a, const double *b, double *out) {
@@ -177,15 +212,15 @@ static void apply_loads(const struct bullet *bullet, client_handle client, const
     }
 }
 
-static int control_step(const struct stepper *stepper, client_handle client) {
+static int control_step(struct stepper *stepper, client_handle client) {
     const struct bullet *bullet = &stepper->bullet;
     for (int step = 0; step < stepper->block->steps_n; step++) {
         move_winches(stepper->block);
-        if (read_bars(bullet, client, stepper->block) != DONE) return REFUSED;
+        if (read_bars(stepper, client) != DONE) return REFUSED;
         apply_loads(bullet, client, stepper->block);
         submit(bullet, client, bullet->b3InitStepSimulationCommand(client));
     }
-    return read_bars(bullet, client, stepper->block);
+    return read_bars(stepper, client);
 }
 
 /* Arguments: the path of pybullet's library; size of the block, low and high half of its address. */
@@ -195,6 +230,7 @@ static int bind(struct b3PluginContext *context, const struct b3PluginArguments 
     struct stepper *stepper = context->user_pointer;
     if (!stepper && !(stepper = context->user_pointer = calloc(1, sizeof *stepper))) return NO_MEMORY;
     stepper->block = NULL;
+    stepper->q = NULL;
     struct block *block = (struct block *)(uintptr_t)address;
     const int result = resolve(&stepper->bullet, arguments->text, block->missing);
     if (result == DONE) stepper->block = block;
@@ -214,7 +250,7 @@ void exitPlugin_t6gps(struct b3PluginContext *context) {
 /* With integers it binds, without it makes one control step; the result is an enum result. */
 int executePluginCommand_t6gps(struct b3PluginContext *context, const struct b3PluginArguments *arguments) {
     if (arguments->ints_n == 3) return bind(context, arguments);
-    const struct stepper *stepper = context->user_pointer;
+    struct stepper *stepper = context->user_pointer;
     if (!stepper || !stepper->block) return NOT_BOUND;
     return control_step(stepper, context->client);
 }
