@@ -20,10 +20,11 @@ import typer
 
 from t6gps.service import bench as benchmarks
 from t6gps.service import config as configuration
-from t6gps.service import display, evaluation, run
+from t6gps.service import display, evaluation, operate, run
 from t6gps.service.config import Config
 from t6gps.service.display import console
 from t6gps.service.executor import Executor
+from t6gps.service.operate import DEFAULT_ROOT, Json, Root, RunName
 from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage import query as sql_query
 from t6gps.storage.catalog import Run
@@ -38,15 +39,14 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "run.steps", "run.workers")
 EXPORT_SECTIONS = ("robot.", "terrain.")
 
-Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
 ]
 Serial = Annotated[bool, typer.Option("--serial", help="Run in this process, without Ray; same data.")]
 Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers (changes the speed only).")]
-RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-DEFAULT_ROOT = Path("runs")
+Autoscale = Annotated[
+    str | None, typer.Option("--autoscale", metavar="MIN:MAX", help="Keep workers between, by backlog and free CPUs.")
+]
 
 
 class Engine(StrEnum):
@@ -93,6 +93,7 @@ def train(
     run_name: Annotated[str | None, typer.Option("--run", help="Name of the run; by default the preset's.")] = None,
     root: Root = DEFAULT_ROOT,
     workers: Workers = None,
+    autoscale: Autoscale = None,
     serial: Serial = False,
     resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
     overrides: Overrides = None,
@@ -100,7 +101,7 @@ def train(
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
     from t6gps.service import figures
 
-    config = configuration.load(source, _with_workers(overrides, workers))
+    config = configuration.load(source, _with_workers(overrides, workers, autoscale))
     name = Path(source).stem if run_name is None else run_name
     if resume:
         this = catalog.open_run(root, name)
@@ -109,10 +110,11 @@ def train(
         this = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
     with catalog.locked(this):
         try:
-            with closing(_executor(config, serial)) as executor:
+            with closing(_executor(config, serial, this)) as executor:
                 with display.ProgressDisplay(config.run.iterations) as progress:
                     run.train(config, this, executor, progress)
                 result = _evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+                executor.finished = True
         except KeyboardInterrupt:
             console.print(
                 f"stopped; everything sampled so far is kept. Go on with: {_again(this, source, root, overrides)}",
@@ -124,6 +126,7 @@ def train(
         pictures = figures.draw(this, config.terrain)
     _print_learning(this)
     display.print_evaluation(result)
+    operate.say_what_is_left_out(this)
     _print_paths(this, pictures, root)
 
 
@@ -147,7 +150,7 @@ def evaluate(
     latest = checkpoint.load_latest(this.checkpoints)
     if latest is None:
         raise RunError(f"run {run_name} has no checkpoint yet; let it finish an iteration")
-    with closing(_executor(config, serial, engine)) as executor:
+    with closing(_executor(config, serial, engine=engine)) as executor:
         executor.ask("restore", *latest[1:])
         result = _evaluated(config, executor, episodes, seed, terrain_seed)
     if as_json:
@@ -269,16 +272,19 @@ def bench(
         display.print_rows(title, rows, {"key": ("key", "{}"), "value": ("value", "{:.4g}")})
 
 
-def _executor(config: Config, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
+operate.add_to(app)
+
+
+def _executor(config: Config, serial: bool, this: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
     executor: Executor
     if serial or engine is Engine.MUJOCO:
         from t6gps.service.serial import SerialExecutor
 
-        executor = SerialExecutor(config, _simulation(engine))
+        executor = SerialExecutor(config, this, _simulation(engine))
     else:
         from t6gps.service.actors import RayExecutor
 
-        executor = RayExecutor(config)
+        executor = RayExecutor(config, this)
     # After the executor is made, since Ray sets a handler of its own.
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     return executor
@@ -303,8 +309,14 @@ def _check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, .
             )
 
 
-def _with_workers(overrides: list[str] | None, workers: int | None) -> list[str]:
-    return (overrides or []) + ([] if workers is None else [f"run.workers={workers}"])
+def _with_workers(overrides: list[str] | None, workers: int | None, autoscale: str | None = None) -> list[str]:
+    wanted = [] if workers is None else [f"run.workers={workers}"]
+    if autoscale is not None:
+        least, colon, most = autoscale.partition(":")
+        if not (colon and least.isdecimal() and most.isdecimal()):
+            raise ConfigError(f"--autoscale takes MIN:MAX, found '{autoscale}'; for example --autoscale 1:8")
+        wanted += [f"run.workers_min={least}", f"run.workers_max={most}"]
+    return (overrides or []) + wanted
 
 
 def _free_name(root: Path, name: str) -> str:

@@ -10,12 +10,14 @@ from importlib import resources
 from pathlib import Path
 from typing import Any
 
-from pydantic import BaseModel, Field, ValidationError
+from pydantic import BaseModel, Field, ValidationError, model_validator
 
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
+
+WORKERS_MOST_N = 10000
 
 
 class RunSettings(Settings):
@@ -25,8 +27,26 @@ class RunSettings(Settings):
     iterations: int = Field(5, ge=1, le=10000, description="iterations I")
     episodes: int = Field(300, ge=1, le=1000000, description="episodes of an iteration, N")
     steps: int = Field(250, ge=2, le=100000, description="control steps of an episode, T (10 per second)")
-    workers: int = Field(2, ge=1, le=10000, description="rollout workers; changes the speed, never the data")
+    workers: int = Field(2, ge=1, le=WORKERS_MOST_N, description="rollout workers; changes the speed, never the data")
+    workers_min: int = Field(1, ge=1, le=WORKERS_MOST_N, description="autoscaling: fewest workers")
+    workers_max: int = Field(0, ge=0, le=WORKERS_MOST_N, description="autoscaling: most workers; 0 keeps `workers`")
+    cpus_per_worker: float = Field(1.0, gt=0.0, le=64.0, description="CPUs that a worker claims; 0.5 puts two on one")
     evaluation_episodes: int = Field(40, ge=2, le=100000, description="noise-free episodes after the last iteration")
+
+    @model_validator(mode="after")
+    def _ordered_workers(self) -> RunSettings:
+        if 0 < self.workers_max < self.workers_min:
+            raise ValueError("workers_min must not exceed workers_max")
+        return self
+
+    @property
+    def autoscale(self) -> tuple[int, int] | None:
+        """Fewest and most workers, None when their number is fixed."""
+        return (self.workers_min, self.workers_max) if self.workers_max else None
+
+
+SPEED_ONLY = {"run.workers", "run.workers_min", "run.workers_max", "run.cpus_per_worker"}
+"""Keys that data do not depend on."""
 
 
 class Config(RolloutSettings):
@@ -109,9 +129,9 @@ def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") 
 
 
 def differences(stored: Config, wanted: Config) -> list[str]:
-    """Keys whose values differ, with both values; the number of workers may differ."""
+    """Keys whose values differ, with both values; those of SPEED_ONLY may differ."""
     a, b = _flat(stored.model_dump()), _flat(wanted.model_dump())
-    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key != "run.workers"]
+    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in SPEED_ONLY]
 
 
 def _overridden(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:

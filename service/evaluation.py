@@ -33,11 +33,11 @@ def evaluate(
     snapshot = executor.ask("policy")
     plans = seeding.evaluation_plans(config, episodes, seed, terrain_seed, snapshot.version)
     summaries = {}
-    for episode in executor.sample(plans, snapshot):
+    for episode in executor.sample(plans, snapshot, "evaluation"):
         summaries[episode.summary["index"][0].as_py()] = episode.summary
         observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
     table = pa.concat_tables([summaries[index] for index in sorted(summaries)])
-    result: Evaluation = {"episodes": episodes, "seed": seed}
+    result: Evaluation = {"episodes": len(summaries), "seed": seed}
     for key, column in EVALUATED.items():
         mean, error = mean_and_error(table[column].to_numpy().astype(float))
         result[key] = {"mean": mean, "standard_error": error}

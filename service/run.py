@@ -21,6 +21,7 @@ from t6gps.service.config import Config
 from t6gps.service.executor import PHASES, Executor
 from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.errors import LearnerDiedError, RunError
 from t6gps.storage.records import Episode
 from t6gps.storage.spool import Spool
 
@@ -41,6 +42,10 @@ DURATION_COLUMNS = {
 }
 
 
+LEARNER_DEATHS_ALLOWED_N = 3
+"""So many in one iteration."""
+
+
 class Observer(Protocol):
     """Whoever watches a run."""
 
@@ -52,14 +57,30 @@ class Observer(Protocol):
 
 
 def train(config: Config, run: Run, executor: Executor, observer: Observer) -> None:
-    """Run the iterations that are missing, from the newest checkpoint on."""
-    latest = checkpoint.load_latest(run.checkpoints)
-    first = 0
-    if latest is not None:
-        first, manifest, arrays = latest
-        executor.ask("restore", manifest, arrays)
-    for iteration in range(first, config.run.iterations):
-        _iterate(config, run, executor, observer, iteration)
+    """Run the iterations that are missing, from the newest checkpoint on.
+
+    A learner that dies is replaced by one that goes on from there, too; LearnerDiedError when that does not help.
+    """
+    deaths_n, resumed = 0, False
+    while True:
+        first = 0
+        try:
+            latest = checkpoint.load_latest(run.checkpoints)
+            if latest is not None:
+                first, manifest, arrays = latest
+                executor.ask("restore", manifest, arrays)
+                if not resumed:
+                    executor.ledger.restore(manifest.get("ledger"))
+            resumed = True
+            for iteration in range(first, config.run.iterations):
+                _iterate(config, run, executor, observer, iteration)
+                deaths_n = 0
+            return
+        except LearnerDiedError:
+            deaths_n += 1
+            if deaths_n > LEARNER_DEATHS_ALLOWED_N:
+                raise
+            executor.replace_learner()
 
 
 def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
@@ -77,15 +98,18 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
             executor.add(episode)
             episodes[episode.summary["episode_id"][0].as_py()] = episode
             observer.progress(iteration, "sample", len(episodes), len(plans))
+    if not episodes:
+        raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
     for phase in PHASES:
         with _timed(durations, phase):
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase, done, total)
     learned, classes = executor.ask("report")
-    ordered = [episodes[plan.episode_id] for plan in plans]
+    ordered = [episodes[plan.episode_id] for plan in plans if plan.episode_id in episodes]
     row = {"iteration": iteration, "policy_version": iteration, **_sampled(ordered), **learned, **durations}
     tables.commit_iteration(run, iteration, ordered, row, classes)
-    checkpoint.save(run.checkpoints, iteration + 1, *executor.ask("state"))
+    manifest, arrays = executor.ask("state")
+    checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
     spool.clear()
     observer.finished(row)
 

@@ -8,6 +8,9 @@ from typing import Any
 from t6gps.learner.learner import Learner
 from t6gps.service.config import Config
 from t6gps.service.executor import Executor
+from t6gps.service.sampler import Failure, attempt
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.physics import Simulation, nominal_rest_length
 from t6gps.workers.settings import RobotSettings
@@ -20,13 +23,31 @@ ACTION_SCALE_M = 0.2
 class SerialExecutor(Executor):
     """One worker and the learner in this process: for debugging, tests and `--serial`."""
 
-    def __init__(self, config: Config, simulation: Callable[[RobotSettings], Simulation] = Simulation) -> None:
+    def __init__(
+        self,
+        config: Config,
+        run: Run | None = None,
+        simulation: Callable[[RobotSettings], Simulation] = Simulation,
+    ) -> None:
+        super().__init__(config, run)
         self._worker = RolloutWorker(config.rollout, simulation)
-        self._learner = new_learner(config)
+        self.replace_learner()
 
-    def sample(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot) -> Iterator[Episode]:
-        for plan in plans:
-            yield self._worker.run(plan, snapshot)
+    def sample(
+        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
+    ) -> Iterator[Episode]:
+        self._open(plans, snapshot, purpose)
+        while (plan := self.ledger.lease(0, 0)) is not None:
+            result = attempt(self._worker, plan, snapshot)
+            if isinstance(result, Failure):
+                if self.ledger.fail(plan, result):
+                    self._quarantine(plan)
+                if self.ledger.hopeless:
+                    raise RunError(f"nothing but failures comes back; the last: episode {plan.episode_id}: {result}")
+                continue
+            self.ledger.arrive(plan)
+            yield result
+            self.ledger.commit(plan.episode_id)
 
     def add(self, episode: Episode) -> None:
         self._learner.add(episode.frames)
@@ -36,6 +57,9 @@ class SerialExecutor(Executor):
 
     def ask(self, method: str, *arguments: Any) -> Any:
         return getattr(self._learner, method)(*arguments)
+
+    def replace_learner(self) -> None:
+        self._learner = new_learner(self.config)
 
     def close(self) -> None:
         self._worker.close()

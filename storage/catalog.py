@@ -5,6 +5,8 @@ ROOT/NAME/tables/         frames, episodes, iterations, classes: Delta tables
 ROOT/NAME/spool/          episodes of the iteration being sampled
 ROOT/NAME/checkpoints/    states of the learner
 ROOT/NAME/figures/        pictures drawn from the tables
+ROOT/NAME/pool/           wish and status of the workers of a run that goes on
+ROOT/NAME/bundles/        episodes that failed, with what is needed to run them alone
 """
 
 from __future__ import annotations
@@ -51,6 +53,14 @@ class Run:
     @property
     def figures(self) -> Path:
         return self.path / "figures"
+
+    @property
+    def pool(self) -> Path:
+        return self.path / "pool"
+
+    @property
+    def bundles(self) -> Path:
+        return self.path / "bundles"
 
     @property
     def config_path(self) -> Path:
@@ -136,3 +146,14 @@ def locked(run: Run) -> Iterator[None]:
         file.write(str(os.getpid()))
         file.flush()
         yield
+
+
+def holder(run: Run) -> int | None:
+    """The process that has the run locked, None when there is none."""
+    with (run.path / ".lock").open("a+") as file:
+        try:
+            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
+        except BlockingIOError:
+            file.seek(0)
+            return int(file.read() or 0)
+    return None

@@ -41,8 +41,8 @@ def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Map
     """
     path = folder / f"iteration-{iteration:06d}"
     try:
-        packed = _packed(arrays)
-        record = {"iteration": iteration, "manifest": dict(manifest), "sha256": {"arrays.npz": _sum(packed)}}
+        archive = packed(arrays)
+        record = {"iteration": iteration, "manifest": dict(manifest), "sha256": {"arrays.npz": _sum(archive)}}
         text = json.dumps(record, allow_nan=False, indent=1).encode()
     except (TypeError, ValueError) as error:
         raise CheckpointError(
@@ -51,7 +51,7 @@ def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Map
     draft = durable.hidden(path)
     shutil.rmtree(draft, ignore_errors=True)  # of a save that was cut off
     draft.mkdir(parents=True)
-    for name, content in (("arrays.npz", packed), ("manifest.json", text), ("DONE", _sum(text).encode())):
+    for name, content in (("arrays.npz", archive), ("manifest.json", text), ("DONE", _sum(text).encode())):
         (draft / name).write_bytes(content)
         durable.sync(draft / name)
     if path.exists():
@@ -70,8 +70,8 @@ def load(path: Path) -> tuple[int, dict[str, JSON], Arrays]:
     done = _bytes(path, "DONE").decode(errors="replace")
     text = _verified(path, "manifest.json", done)
     record = json.loads(text)
-    packed = _verified(path, "arrays.npz", record["sha256"]["arrays.npz"])
-    with np.load(io.BytesIO(packed), allow_pickle=False) as archive:
+    content = _verified(path, "arrays.npz", record["sha256"]["arrays.npz"])
+    with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
     return record["iteration"], record["manifest"], arrays
 
@@ -101,7 +101,7 @@ def _found(folder: Path) -> list[Path]:
     return sorted(folder.glob("iteration-*"), reverse=True)
 
 
-def _packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     """An .npz archive; numpy's own writer reserves some names of arrays for its arguments."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:

@@ -13,6 +13,10 @@ class RunError(T6GpsError):
     """A run that does not exist, cannot be created, or cannot be continued."""
 
 
+class LearnerDiedError(RunError):
+    """The learner's process ended; another one can go on from the newest checkpoint and the spool."""
+
+
 class DataError(T6GpsError):
     """A table that does not follow its schema: wrong column, type, length, null, or a non-finite number."""
 

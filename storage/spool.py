@@ -59,11 +59,7 @@ class Spool:
         durable.sync(folder)
 
     def append(self, episode: Episode) -> None:
-        """Keep `episode`; once this returns, it survives a crash. The same episode again replaces its file.
-
-        Raises DataError when a table breaks its schema or belongs to another iteration.
-        """
-        checked(episode, self.iteration)
+        """Keep a `checked` episode; once this returns, it survives a crash. The same one again replaces its file."""
         path = self._folder / f"episode-{episode.summary.column('episode_id')[0].as_py():012d}.arrow"
         with durable.hidden(path).open("wb") as file:
             for table in (episode.frames, episode.summary):

@@ -21,7 +21,6 @@ from t6gps.storage import durable, parquet, schema
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
-from t6gps.storage.spool import checked
 
 EPISODES_PER_ROW_GROUP_N = 10
 """One episode is read without the rest of its iteration: 10 episodes are about 2.5 MB."""
@@ -50,7 +49,7 @@ def commit_iteration(
         raise RunError(f"{run.path}: iterations are committed in turn; next is {expected}, found {iteration}")
     if not episodes:
         raise DataError(f"iteration {iteration} has no episodes; sample at least one")
-    pieces = sorted((checked(episode, iteration) for episode in episodes), key=_episode_id)
+    pieces = sorted(episodes, key=_episode_id)
     if len({_episode_id(episode) for episode in pieces}) < len(pieces):
         raise DataError(f"iteration {iteration}: an episode was given twice; every episode_id must be unique")
     size_n = EPISODES_PER_ROW_GROUP_N

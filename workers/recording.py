@@ -11,7 +11,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.storage.records import Episode, EpisodePlan
-from t6gps.storage.schema import EPISODES, FRAMES, check, vector_length
+from t6gps.storage.schema import EPISODES, FRAMES, vector_length
 from t6gps.workers.physics import CONTROL_STEP_S
 from t6gps.workers.settings import RolloutSettings
 from t6gps.workers.state import RobotState
@@ -52,7 +52,7 @@ class Outcome:
 
 
 def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings) -> Episode:
-    """The two tables of an episode, checked against their schemas (DataError if something is not finite)."""
+    """The two tables of an episode; whoever hands them on checks them."""
     rows = len(record.states)
     state = RobotState(*(_stacked([getattr(s, name) for s in record.states]) for name in RobotState.__annotations__))
     element = np.array([frame.element for frame in record.frames])
@@ -133,10 +133,9 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
         "winch_speed_m_per_s": settings.robot.winch_speed_m_per_s,
         "delay_steps": outcome.delay_steps,
     }
-    where = f"episode {plan.episode_id}"
     return Episode(
-        check(pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES), FRAMES, where),
-        check(pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES), EPISODES, where),
+        pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
+        pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
     )
 
 

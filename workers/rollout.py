@@ -22,11 +22,13 @@ def rollout(
     plan: EpisodePlan,
     snapshot: PolicySnapshot,
     delay_steps: int = 0,
+    record: Record | None = None,
 ) -> Episode:
     """Run the episode that `plan` describes with the policy `snapshot` plus exploration noise.
 
     The result depends on the arguments alone, whatever the simulation did before. An episode that leaves the ground
-    or the range of sound states ends there and says why in `ended_by`; PhysicsError if it does so at once.
+    or the range of sound states ends there and says why in `ended_by`; PhysicsError if it does so at once. An empty
+    `record` of the caller's is filled as the episode goes: it shows how far one came that failed.
     """
     episode = RunningEpisode(
         simulation, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, snapshot.offset_m, delay_steps
@@ -34,7 +36,7 @@ def rollout(
     noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
 
-    record = Record()
+    record = Record() if record is None else record
     _keep(record, episode)
     ended_by = "completed"
     for _ in range(plan.steps):

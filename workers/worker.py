@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import asdict
+from typing import Any
 
 import numpy as np
 
@@ -11,10 +13,12 @@ from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers import policy
 from t6gps.workers.physics import Simulation
 from t6gps.workers.randomisation import draw
+from t6gps.workers.recording import Record
 from t6gps.workers.rollout import rollout
 from t6gps.workers.settings import RobotSettings, RolloutSettings
 from t6gps.workers.topology import CABLES_N
 
+LAST_STATES_N = 5
 RANDOMISATION_STREAM = 3
 """Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
 
@@ -31,9 +35,11 @@ class RolloutWorker:
         self._settings = settings
         self._make_simulation = simulation
         self._simulation = simulation(settings.robot)
+        self._record = Record()
 
     def run(self, plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
         """Run one episode. DataError if the policy does not fit the robot, PhysicsError if the start is unsound."""
+        self._record = Record()
         policy.check(snapshot, OBSERVATION_N, CABLES_N)
         rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(RANDOMISATION_STREAM,)))
         robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
@@ -41,7 +47,14 @@ class RolloutWorker:
             self._simulation.close()
             self._simulation = self._make_simulation(robot)
         settings = self._settings.model_copy(update={"robot": robot})
-        return rollout(self._simulation, settings, plan, snapshot, delay_steps)
+        return rollout(self._simulation, settings, plan, snapshot, delay_steps, self._record)
+
+    def position(self) -> tuple[int, list[dict[str, Any]]]:
+        """Control step of the newest episode, and its last states: where it stands, or where it failed."""
+        states = self._record.states[-LAST_STATES_N:]
+        return len(self._record.actions), [
+            {name: values.tolist() for name, values in asdict(state).items()} for state in states
+        ]
 
     def close(self) -> None:
         """Release the simulator."""

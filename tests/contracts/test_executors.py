@@ -1,5 +1,7 @@
 """Contracts between twins: serial and Ray executors, the policy in numpy and in torch."""
 
+import os
+import signal
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
@@ -34,16 +36,34 @@ class Silent:
     def finished(self, row: dict[str, Any]) -> None: ...
 
 
+class Kills(Silent):
+    """Kills a worker in the second iteration's sampling, and the learner while it fits."""
+
+    def __init__(self, executor: RayExecutor) -> None:
+        self.executor, self.done = executor, set[str]()
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        if (iteration, phase, done) == (1, "sample", 2) and "worker" not in self.done:
+            self.done.add("worker")
+            worker = next(worker for worker in self.executor.pool.workers.values() if worker.identity)
+            os.kill(worker.identity.pid, signal.SIGKILL)
+        if (iteration, phase) == (1, "fit") and "learner" not in self.done:
+            self.done.add("learner")
+            ray.kill(self.executor._learner)
+
+
 @pytest.fixture(autouse=True)
 def no_ray_left_behind() -> Iterator[None]:
     yield
     assert not ray.is_initialized()
 
 
-def result_of(config: Config, executor: Executor, root: Path) -> tuple[Any, Any, list[bytes]]:
+def result_of(
+    config: Config, executor: Executor, root: Path, observer: run.Observer | None = None
+) -> tuple[Any, Any, list[bytes]]:
     this = catalog.create(root, f"run-{type(executor).__name__}-{config.run.workers}", config.to_json())
     try:
-        run.train(config, this, executor, Silent())
+        run.train(config, this, executor, observer or Silent())
     finally:
         executor.close()
     latest = checkpoint.load_latest(this.checkpoints)
@@ -52,13 +72,26 @@ def result_of(config: Config, executor: Executor, root: Path) -> tuple[Any, Any,
     return tables.read(this, "frames"), tables.read(this, "episodes"), weights
 
 
-@pytest.mark.slow
-def test_serial_and_ray_with_one_and_two_workers_give_identical_episodes_and_weights(tmp_path: Path) -> None:
+@pytest.fixture(scope="module")
+def serial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[bytes]]:
     config = load("flat-quick", TINY)
-    serial = result_of(config, SerialExecutor(config), tmp_path)
-    for workers in (1, 2):
-        config = load("flat-quick", [*TINY, f"run.workers={workers}"])
-        assert result_of(config, RayExecutor(config), tmp_path) == serial
+    return result_of(config, SerialExecutor(config), tmp_path_factory.mktemp("serial"))
+
+
+@pytest.mark.slow
+def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, serial: Any) -> None:
+    config = load("flat-quick", [*TINY, "run.workers=1"])
+    assert result_of(config, RayExecutor(config), tmp_path) == serial
+
+
+@pytest.mark.slow
+def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(tmp_path: Path, serial: Any) -> None:
+    config = load("flat-quick", [*TINY, "run.workers=2"])
+    executor = RayExecutor(config)
+    kills = Kills(executor)
+    assert result_of(config, executor, tmp_path, kills) == serial
+    assert kills.done == {"worker", "learner"}
+    assert executor.pool.counters["crashed"] == 1
 
 
 def test_the_policy_is_the_same_in_numpy_and_in_torch() -> None:

@@ -1,4 +1,4 @@
-"""Laws of the processes that a run starts: they listen to this machine alone, and their death is one clear sentence."""
+"""Laws of the processes that a run starts: they listen to this machine alone, are replaced, and end with the run."""
 
 import os
 import signal
@@ -8,6 +8,10 @@ from collections.abc import Callable
 from pathlib import Path
 
 import pytest
+
+from t6gps.service import control
+from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
 
 TRAIN = [
     sys.executable, "-m", "t6gps.service.cli", "train", "flat-quick", "--run", "watched", "--workers", "1",
@@ -51,25 +55,37 @@ def listeners(pids: dict[int, str]) -> set[str]:
 
 
 @pytest.mark.slow
-def test_a_run_listens_on_loopback_alone_and_says_so_when_a_worker_dies(
+def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behind_when_it_is_stopped(
     tmp_path: Path, wait_until: Callable[..., None]
 ) -> None:
-    started = subprocess.Popen([*TRAIN, "--root", str(tmp_path)], stderr=subprocess.PIPE, start_new_session=True)
-    try:
-        spooled = "watched/spool/*/episode-*.arrow"
-        wait_until(lambda: started.poll() is not None or len(list(tmp_path.glob(spooled))) >= 2, 120)
+    command = [*TRAIN, "--root", str(tmp_path)]
+    started = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
+    this = catalog.Run(tmp_path / "watched")
+
+    def spooled() -> int:
         assert started.poll() is None
+        return len(list(tmp_path.glob("watched/spool/*/episode-*.arrow")))
+
+    try:
+        wait_until(lambda: spooled() >= 2, 120)
         family = descendants(started.pid)
         assert listeners(family)
         assert listeners(family) <= set(LOOPBACK)
-        worker = next(pid for pid, command in family.items() if command.startswith("ray::WorkerActor"))
-        os.kill(worker, signal.SIGKILL)
-        _, message = started.communicate(timeout=60)
+        os.kill(control.status(this)["workers"][0]["pid"], signal.SIGKILL)
+        before = spooled()
+        wait_until(lambda: spooled() >= before + 5, 60)
+        assert control.status(this)["processes"]["crashed"] == 1
+        family = descendants(started.pid)
+        for _ in range(2):  # the second stop does nothing
+            started.send_signal(signal.SIGTERM)
+        _, message = started.communicate(timeout=30)
     finally:
         started.kill()
-    assert started.returncode == 2
-    assert message.count(b"error: ") == 1
-    assert b"a process of the run died" in message
+    assert started.returncode == 130, message
     assert b"--resume" in message
     assert b"Traceback" not in message
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 30)
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 10)
+    assert control.status(this)["state"] == "STOPPED"
+    with pytest.raises(RunError, match=r"not running \(STOPPED.*--resume"):
+        control.scale(this, 2)
+    assert not (this.pool / "wish.json").exists()

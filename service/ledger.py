@@ -1,0 +1,161 @@
+"""The book of the episodes being sampled: executed at least once, committed exactly once.
+
+    planned -> leased (slot, incarnation) -> arrived -> committed
+       ^          |                             |
+       +----------+   given back, failed        +-> dropped and counted when nobody waits for it any more
+                  +-> quarantined after three failures
+
+Committed means durable in the spool. The ledger knows neither processes nor the time: `pool` finds out which leases
+have outlived their deadline.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Iterable, Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+from t6gps.service.sampler import Failure
+from t6gps.storage.records import EpisodePlan
+
+FAILURES_ALLOWED_N = 3
+"""An episode that has failed this often is quarantined."""
+HOPELESS_N, HOPELESS_LATER_N = 5, 20
+"""So many quarantined episodes in a row, before and after a first one was committed, mean that nothing works."""
+COUNTERS = ("committed", "duplicates", "late", "expired", "given_back", "failures", "quarantined")
+
+
+@dataclass(frozen=True)
+class Lease:
+    """A plan in the hands of a worker."""
+
+    plan: EpisodePlan
+    slot: int
+    incarnation: int
+
+
+class Ledger:
+    """What is planned, leased, arrived, committed and quarantined.
+
+    counters   of the whole run, by COUNTERS; part of every checkpoint
+    """
+
+    def __init__(self) -> None:
+        self.counters = dict.fromkeys(COUNTERS, 0)
+        self.failures: dict[int, list[Failure]] = {}
+        self.quarantined: set[int] = set()
+        self._waiting: deque[EpisodePlan] = deque()
+        self._leases: dict[int, Lease] = {}
+        self._arrived: dict[int, Lease] = {}
+        self._committed: set[int] = set()
+        self._in_a_row = 0
+        self._worked = False
+
+    def open(self, plans: Sequence[EpisodePlan], quarantined: Iterable[int] = ()) -> None:
+        """Begin a new book; `quarantined` episodes are left out. What comes of other plans than these is late."""
+        self.quarantined = set(quarantined)
+        self.failures.clear()
+        missing = {plan.episode_id: plan for plan in plans if plan.episode_id not in self.quarantined}
+        self._leases = {n: lease for n, lease in self._leases.items() if missing.get(n) == lease.plan}
+        self._waiting = deque(plan for n, plan in missing.items() if n not in self._leases)
+        self._arrived.clear()
+        self._committed.clear()
+
+    @property
+    def backlog(self) -> int:
+        """Episodes that are neither committed nor quarantined."""
+        return len(self._waiting) + len(self._leases) + len(self._arrived)
+
+    @property
+    def waiting(self) -> int:
+        """Episodes that nobody has leased."""
+        return len(self._waiting)
+
+    @property
+    def arrived(self) -> int:
+        """Episodes that came back and are not committed yet."""
+        return len(self._arrived)
+
+    @property
+    def leases(self) -> Mapping[int, Lease]:
+        """Leases by episode."""
+        return self._leases
+
+    @property
+    def hopeless(self) -> bool:
+        """True when nothing but failures comes back."""
+        if self._worked:
+            return self._in_a_row >= HOPELESS_LATER_N
+        return self._in_a_row >= HOPELESS_N or (self._in_a_row > 0 and not self.backlog)
+
+    def lease(self, slot: int, incarnation: int) -> EpisodePlan | None:
+        """The next plan for a worker, None when there is none."""
+        if not self._waiting:
+            return None
+        plan = self._waiting.popleft()
+        self._leases[plan.episode_id] = Lease(plan, slot, incarnation)
+        return plan
+
+    def arrive(self, plan: EpisodePlan) -> bool:
+        """An episode came back, from whomever. False, and counted, when it is a duplicate or late: drop it."""
+        number = plan.episode_id
+        lease = self._leases.get(number)
+        if lease is not None and lease.plan == plan:
+            self._arrived[number] = self._leases.pop(number)
+        elif plan in self._waiting:  # the lease was given up too early; its result is as good as any
+            self._waiting.remove(plan)
+            self._arrived[number] = Lease(plan, -1, -1)
+        else:
+            known = number in self._committed or (number in self._arrived and self._arrived[number].plan == plan)
+            self.counters["duplicates" if known else "late"] += 1
+            return False
+        return True
+
+    def commit(self, episode_id: int) -> None:
+        """The episode is durable."""
+        del self._arrived[episode_id]
+        self._committed.add(episode_id)
+        self._in_a_row, self._worked = 0, True
+        self.counters["committed"] += 1
+
+    def give_back(self, slot: int, incarnation: int, keep: int | None = None) -> list[EpisodePlan]:
+        """Return a worker's leases, but for `keep`, to the head of the queue; the plans that were returned."""
+        returned = [
+            lease
+            for lease in self._leases.values()
+            if (lease.slot, lease.incarnation) == (slot, incarnation) and lease.plan.episode_id != keep
+        ]
+        for lease in reversed(returned):
+            del self._leases[lease.plan.episode_id]
+            self._waiting.appendleft(lease.plan)
+        self.counters["given_back"] += len(returned)
+        return [lease.plan for lease in returned]
+
+    def fail(self, plan: EpisodePlan, failure: Failure) -> bool:
+        """An attempt failed. The plan goes back to the queue; True when it is quarantined, after its third failure."""
+        self.counters["failures"] += 1
+        self.counters["expired"] += failure.kind == "hang"
+        lease = self._leases.get(plan.episode_id)
+        if lease is None or lease.plan != plan:
+            return False  # somebody else has it by now
+        del self._leases[plan.episode_id]
+        history = self.failures.setdefault(plan.episode_id, [])
+        history.append(failure)
+        if len(history) < FAILURES_ALLOWED_N:
+            self._waiting.appendleft(plan)
+            return False
+        self.quarantined.add(plan.episode_id)
+        self.counters["quarantined"] += 1
+        self._in_a_row += 1
+        return True
+
+    def state(self) -> dict[str, Any]:
+        """What a resumed run goes on with: the counters. Which episodes are missing stands in spool and bundles."""
+        return {"counters": dict(self.counters)}
+
+    def restore(self, state: Any) -> None:
+        """Go on from `state()`; nothing changes for a checkpoint that has none."""
+        if state is None:
+            return
+        self.counters |= {name: int(state["counters"].get(name, 0)) for name in COUNTERS}

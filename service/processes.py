@@ -1,0 +1,79 @@
+"""Looking at processes of this machine from outside, also when they hang and answer nothing.
+
+A worker registers `dump_stacks_on_signal`; then its stacks can be had even while C code holds the interpreter's lock.
+"""
+
+from __future__ import annotations
+
+import faulthandler
+import os
+import signal
+import time
+from dataclasses import dataclass
+from pathlib import Path
+
+STACKS_S = 0.3
+LOG_TAIL_BYTES = 4000
+
+
+@dataclass(frozen=True)
+class Process:
+    """A process of some machine. `started` tells it from a later one with the same number."""
+
+    pid: int
+    started: int
+    stacks: int
+    """File descriptor, in that process, of the memory that its stacks are written to."""
+
+
+def dump_stacks_on_signal() -> Process:
+    """Let SIGUSR1 write the stacks of this process to a file in memory; this process, for `stacks` and `kill`."""
+    descriptor = os.memfd_create("stacks")
+    faulthandler.register(signal.SIGUSR1, file=descriptor, all_threads=True)
+    return Process(os.getpid(), _stat(os.getpid())[1], descriptor)
+
+
+def stacks(process: Process) -> str:
+    """Stacks of a process of this machine, or what can be said in their place."""
+    try:
+        state, started = _stat(process.pid)
+    except OSError:
+        return "the process has ended"
+    if started != process.started or state == "Z":
+        return "the process has ended"
+    if state == "T":
+        return "the process is stopped (SIGSTOP): it has no stack to show"
+    file = Path(f"/proc/{process.pid}/fd/{process.stacks}")
+    try:
+        os.kill(process.pid, signal.SIGUSR1)
+        deadline, found, before = time.monotonic() + STACKS_S, b"", None
+        while time.monotonic() < deadline and (not found or found != before):
+            time.sleep(0.01)
+            before, found = found, file.read_bytes()
+    except OSError as error:
+        return f"its stacks could not be read: {error}"
+    return found.decode(errors="replace") or f"no stacks within {STACKS_S} s; process state {state}"
+
+
+def kill(process: Process) -> None:
+    """End a process of this machine at once, also a stopped one; one that has ended already is left alone."""
+    try:
+        if _stat(process.pid)[1] == process.started:
+            os.kill(process.pid, signal.SIGKILL)
+    except (FileNotFoundError, ProcessLookupError):
+        pass
+
+
+def log_tail(folder: Path, pid: int) -> str:
+    """The end of what a process of this machine wrote to its logs in `folder`."""
+    text = ""
+    for path in sorted(folder.glob(f"worker-*-{pid}.*")):
+        content = path.read_bytes()[-LOG_TAIL_BYTES:]
+        text += content.decode(errors="replace")
+    return text
+
+
+def _stat(pid: int) -> tuple[str, int]:
+    """State letter and start time of a process. FileNotFoundError or ProcessLookupError when there is none."""
+    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    return fields[0], int(fields[19])
