@@ -13,3 +13,5 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS"):
 if "RAY_ADDRESS" not in os.environ:
     os.environ.setdefault("RAY_AUTH_MODE", "token")
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
+    # Ray would run the workers at the lowest priority but four: on a busy machine they hardly start.
+    os.environ.setdefault("RAY_worker_niceness", "0")

@@ -40,7 +40,7 @@ from t6gps.workers.worker import RolloutWorker
 MakeWorker = Callable[[RolloutSettings], Runner]
 OBJECT_STORE_BYTES = 2 * 1024**3
 PULL_DEADLINE_S = 10.0
-HOLDER_PING_S, HOLDER_START_S = 0.5, 20.0
+HOLDER_PING_S, HOLDER_START_S = 0.5, 60.0
 """How often the holder is asked for a sign of life, and how long its process may take to start and give one."""
 VERSIONS_HELD_N = 2
 _log = logging.getLogger(__name__)
@@ -189,9 +189,8 @@ class RayTransport(Transport):
 
     def __init__(self, make_worker: MakeWorker, settings: RolloutSettings, cpus_per_worker: float) -> None:
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
-        context = ray.get_runtime_context()
-        self._node = context.get_node_id()
-        self._logs = Path(context.get_session_dir()) / "logs" if hasattr(context, "get_session_dir") else None
+        self._node = ray.get_runtime_context().get_node_id()
+        self._logs = Path(ray_worker._global_node.get_logs_dir_path())  # type: ignore[attr-defined]
         self._asked: dict[Any, tuple[_Remote, EpisodePlan | None, Any]] = {}
         self._held: dict[int, PolicySnapshot] = {}
         self._holder = _start(HolderActor)
@@ -258,8 +257,7 @@ class RayTransport(Transport):
             return Remains("the process was never ready")
         if handle.node != self._node:
             return Remains(f"the process is on another node ({handle.node})")
-        log = processes.log_tail(self._logs, handle.process.pid) if self._logs else ""
-        return Remains(processes.stacks(handle.process), log)
+        return Remains(processes.stacks(handle.process), processes.log_tail(self._logs, handle.process.pid))
 
     def kill(self, handle: _Remote) -> None:
         ray.kill(handle.actor)
@@ -410,20 +408,32 @@ def _join_or_start(config: Config) -> int:
     """Join the cluster of RAY_ADDRESS or start an embedded one; the largest number of workers that may be wished."""
     ray_worker.print_to_stdstream = _to_log
     if "RAY_ADDRESS" in os.environ:
-        ray.init(log_to_driver=False)
+        _init()
         return WORKERS_MOST_N  # nodes may join later
     # The address below would be replaced by that of the host, and the ports opened to its network.
     services.resolve_ip_for_localhost = _as_given
     each = config.run.cpus_per_worker
     workers_n = max(config.run.workers, *(config.run.autoscale or (0,)))
     cpus_n = max(math.ceil(workers_n * each), os.cpu_count() or 1)
-    ray.init(
+    _init(
         address="local",
         num_cpus=cpus_n,
         include_dashboard=False,
-        log_to_driver=False,
         object_store_memory=OBJECT_STORE_BYTES,
         logging_level=logging.ERROR,
         _node_ip_address="127.0.0.1",
     )
     return int(cpus_n / each + 1e-6)
+
+
+def _init(**options: Any) -> None:
+    """Start or join Ray. RunError when that fails."""
+    try:
+        ray.init(log_to_driver=False, **options)
+    except Exception as error:  # Ray has no narrower one for this
+        ray.shutdown()
+        where = os.environ.get("RAY_ADDRESS", "on this machine")
+        raise RunError(
+            f"Ray could not be started or joined ({where}): {' '.join(str(error).split())}; check RAY_ADDRESS and the "
+            "token, try again when the machine is less busy, or use --serial"
+        ) from error

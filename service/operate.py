@@ -33,7 +33,8 @@ WORKER_COLUMNS = {
 
 def add_to(app: typer.Typer) -> None:
     """Make the commands part of `t6gps`."""
-    for command in (scale, status, replay):
+    app.command(context_settings={"ignore_unknown_options": True})(scale)  # so that -1 is a number, and refused as one
+    for command in (status, replay):
         app.command()(command)
 
 

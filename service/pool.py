@@ -30,10 +30,10 @@ BYTES_IN_FLIGHT = 2**30
 FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S = 0.5, 30.0
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
-START_DEADLINE_S = 90.0
+START_DEADLINE_S = 180.0
 PENDING_AFTER_S = 3.0
 """A process needs so long to start, also where there is room for it."""
-PING_S, PING_DEADLINE_S = 1.0, 10.0
+PING_S, PING_DEADLINE_S = 1.0, 20.0
 CAPACITY_S = 1.0
 """How often the cluster is asked for room."""
 SHRINK_AFTER_S = 30.0
@@ -397,6 +397,7 @@ class Pool:
             ],
             "backlog": self.ledger.backlog,
             "leases": len(self.ledger.leases),
+            "arrived": self.ledger.arrived,
             "bytes_in_flight": (len(self.ledger.leases) + self.ledger.arrived) * self._largest_bytes,
             "waits": waits,
             "quarantined": sorted(self.ledger.quarantined),

@@ -107,6 +107,7 @@ def _hang_in_c(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
 
 
 def _exit(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
+    print(f"episode {plan.episode_id} was ordered to exit", flush=True)
     os._exit(1)
 
 
