@@ -9,19 +9,21 @@ for done, total in learner.supervise(): ...         learner.snapshot is now the 
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg, policy, supervised, surrogate, warping
-from t6gps.learner.features import NONE, Rows, read_rows
+from t6gps.learner import cost, lqg, policy, report, supervised, surrogate
+from t6gps.learner.features import Rows, read_rows
 from t6gps.learner.modes import FitOptions
-from t6gps.learner.segments import SegmentGroup, Segments, cut, group
+from t6gps.learner.report import Fitted, Improved, Segmented, Trained, root_mean_square
+from t6gps.learner.segments import cut, group
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage import schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError
@@ -37,26 +39,8 @@ Phase = TypeVar("Phase")
 LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM = 1, 1, 2
 """Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy)."""
 CHUNK = 256
-"""Sub-trajectories solved at once: their matrices stay in the cache."""
-
-
-@dataclass(frozen=True)
-class _Segmented:
-    rows: Rows
-    segments: Segments
-    groups: list[SegmentGroup]
-
-
-@dataclass(frozen=True)
-class _Fitted:
-    fits: dict[int, surrogate.ClassModel]
-    patch: surrogate.Patch
-
-
-@dataclass(frozen=True)
-class _Improved:
-    pairs: Pairs
-    report: dict[str, Any]
+"""Sub-trajectories solved at once: their matrices stay in the cache. Chunks do not depend on each other, so they run on
+all cores, which the workers leave idle while the learner works, with the same result."""
 
 
 class Learner:
@@ -101,10 +85,10 @@ class Learner:
         )
         self._replayed: deque[Pairs] = deque(maxlen=settings.replay_iterations)
         self._episodes: dict[int, pa.Table] = {}
-        self._segmented: _Segmented | None = None
-        self._fitted: _Fitted | None = None
-        self._improved: _Improved | None = None
-        self._supervised_loss = np.nan
+        self._segmented: Segmented | None = None
+        self._fitted: Fitted | None = None
+        self._improved: Improved | None = None
+        self._trained: Trained | None = None
 
     def _rng(self, iteration: int, stream: int) -> np.random.Generator:
         branch = (LEARNER_STREAM, iteration, stream)
@@ -125,11 +109,11 @@ class Learner:
         """Cut the episodes into segments and classify them (lines 3 to 5); the learner lets go of their tables."""
         rows = read_rows(self._episodes, self._settings.reduced_state)
         self._episodes.clear()
-        self._fitted = self._improved = None
+        self._fitted = self._improved = self._trained = None
         yield 1, 2
         segments = cut(rows, self._settings.longest_segment_steps)
         groups = group(segments, self._settings.smallest_class_segments)
-        self._segmented = _Segmented(rows, segments, groups)
+        self._segmented = Segmented(rows, segments, groups)
         yield 2, 2
 
     def fit(self) -> Iterator[tuple[int, int]]:
@@ -145,41 +129,42 @@ class Learner:
             fits[number] = fitted
             yield len(fits), len(jobs)
         patch = surrogate.patch(list(jobs.values()), list(fits.values()), len(data.rows.acts))
-        self._fitted = _Fitted(fits, patch)
+        self._fitted = Fitted(fits, patch)
 
     def backward_pass(self) -> Iterator[tuple[int, int]]:
         """Improve the actions along all sub-trajectories (lines 8 to 11)."""
         rows, patch = _of(self._segmented, "segment").rows, _of(self._fitted, "fit").patch
-        settings, index = self._settings, np.flatnonzero(rows.continues)
+        settings = self._settings
         weights = self._target_speed_m_per_s, self._vertical_weight
         gradient = cost.gradient(rows.state, rows.target, *weights)
         hessian = cost.hessian(rows.state.shape[1], self._vertical_weight)
         deviation, variance = self._deviation(rows, patch)
         models = lqg.prepare(patch.models, settings.kl_weight, variance)
-        improved = np.full_like(rows.action, np.nan)
-        pieces = lqg.sub_trajectories(rows.continues, settings.horizon_steps)
-        total, done, change = sum(map(len, pieces.values())), 0, 0.0
-        for length, starts in pieces.items():
-            for first in range(0, len(starts), CHUNK):
-                steps = starts[first : first + CHUNK, None] + np.arange(length)
-                result = lqg.backward_pass(models, patch.of_row[steps], gradient[steps + 1], hessian, deviation[steps])
-                improved[steps] = rows.action[steps] + result.k
-                change += float(result.predicted_cost_change.sum())
+        improved, predicted = np.full_like(rows.action, np.nan), np.full(len(rows.acts), np.nan, dtype=np.float32)
+        chunks = [
+            starts[first : first + CHUNK, None] + np.arange(length)
+            for length, starts in lqg.sub_trajectories(rows.continues, settings.horizon_steps).items()
+            for first in range(0, len(starts), CHUNK)
+        ]
+
+        def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
+            result = lqg.backward_pass(models, patch.of_row[steps], gradient[steps + 1], hessian, deviation[steps])
+            return result.k, result.predicted_cost_change
+
+        total, done = sum(map(len, chunks)), 0
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
+            for steps, (k, change) in zip(chunks, threads.map(improve, chunks), strict=True):
+                improved[steps], predicted[steps] = rows.action[steps] + k, change
                 done += len(steps)
                 yield done, total
-        actions = np.clip(improved[index], *self._command_range_m).astype(np.float32)
-        report = {
-            "sub_trajectories": total,
-            "predicted_cost_change": change / len(index),
-            "action_change_m": _root_mean_square(actions - rows.action_mean[index]),
-        }
-        self._improved = _Improved((rows.observation[index], actions), report)
+        improved = np.clip(improved, *self._command_range_m).astype(np.float32)
+        self._improved = Improved(improved, predicted, total)
 
     def _deviation(self, rows: Rows, patch: surrogate.Patch) -> tuple[NDArray[np.float32], float | None]:
         """Recorded action minus policy mean [n, nu], and the exploration variance if it is to replace the fitted S."""
         deviation = rows.action - rows.action_mean
         if self._settings.deviation_from == "recorded":
-            return deviation, _root_mean_square(deviation[rows.continues]) ** 2
+            return deviation, root_mean_square(deviation[rows.continues]) ** 2
         P, p = (array.astype(np.float32) for array in (patch.models.P, patch.models.p))
         for model in np.unique(patch.of_row[rows.continues]):
             chosen = np.flatnonzero(patch.of_row == model)
@@ -188,51 +173,25 @@ class Learner:
 
     def supervise(self) -> Iterator[tuple[int, int]]:
         """Train the policy on this iteration's pairs and the replayed ones (line 13)."""
-        pairs = _of(self._improved, "backward_pass").pairs
+        rows, improved = _of(self._segmented, "segment").rows, _of(self._improved, "backward_pass")
+        pairs = rows.observation[rows.continues], improved.action[rows.continues]
         observations, actions = (np.concatenate(part) for part in zip(*self._replayed, pairs, strict=True))
         rng = self._rng(self.snapshot.version, SUPERVISED_STREAM)
         training = supervised.train(self.snapshot, observations, actions, self._settings, rng)
-        self.snapshot, self._supervised_loss = yield from training
+        self.snapshot, loss = yield from training
         self._replayed.append(pairs)
+        mean = np.clip(policy.act(self.snapshot, rows.observation), *self._command_range_m)
+        self._trained = Trained(loss, mean)
 
     def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
         """The learner's columns of `iterations` and the rows of `classes` of the iteration just finished."""
-        data, fitted = _of(self._segmented, "segment"), _of(self._fitted, "fit")
-        modes = np.concatenate([fit.modes[fit.modes > 0] for fit in fitted.fits.values()])
-        iteration = {
-            "segments": len(data.segments.start),
-            "classes": sum(not group.pooled for group in data.groups),
-            "modes": float(modes.mean()),
-            "residual": float(np.nanmean(fitted.patch.residual)),
-            **_of(self._improved, "backward_pass").report,
-            "supervised_loss": self._supervised_loss,
-        }
-        return iteration, self._class_rows(data, fitted)
-
-    def _class_rows(self, data: _Segmented, fitted: _Fitted) -> list[dict[str, Any]]:
-        lengths, rows = data.segments.stop - data.segments.start, []
-        for number, group_ in enumerate(data.groups):
-            fit = fitted.fits.get(number)
-            crosses = group_.key.exit != NONE
-            for key, members in group_.classes.items():
-                residual = fitted.patch.residual[np.isin(data.segments.of_row, members)]
-                sampled = np.isfinite(residual)
-                rows.append(
-                    {
-                        "iteration": self.snapshot.version - 1,
-                        "kind": key.kind,
-                        "entry_edge": None if key.entry == NONE else key.entry,
-                        "exit_edge": None if key.exit == NONE else key.exit,
-                        "truncated": key.truncated,
-                        "segments": len(members),
-                        "rows": int(lengths[members].sum()),
-                        "time_steps": warping.class_steps(lengths[group_.segments], crosses),
-                        "pooled": group_.pooled,
-                        "modes": float(fit.modes[fit.modes > 0].mean()) if fit else 0.0,
-                        "residual": float(residual[sampled].mean()) if sampled.any() else 0.0,
-                    }
-                )
-        return rows
+        segmented, fitted = _of(self._segmented, "segment"), _of(self._fitted, "fit")
+        improved, trained = _of(self._improved, "backward_pass"), _of(self._trained, "supervise")
+        iteration = report.iteration_row(segmented, fitted, improved, trained, self._command_range_m)
+        weights = self._target_speed_m_per_s, self._vertical_weight
+        classes = report.class_rows(segmented, fitted, improved, trained, *weights)
+        number = {"iteration": self.snapshot.version - 1}
+        return iteration, [number | row for row in classes]
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
         """What the next iteration depends on, between two iterations: policy and replayed pairs."""
@@ -280,7 +239,3 @@ def _of(result: Phase | None, phase: str) -> Phase:
     if result is None:
         raise RunError(f"{phase}() must come first; an iteration runs segment, fit, backward_pass, supervise")
     return result
-
-
-def _root_mean_square(values: NDArray[np.float32]) -> float:
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))

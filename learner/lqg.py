@@ -38,8 +38,8 @@ ACTION_VARIANCE_FLOOR_M2 = 1e-4
 class Improvement:
     """Improved policies of b sub-trajectories: K [b, T, nu, nx], k [b, T, nu], and what the models promise.
 
-    predicted_cost_change   change of the summed running cost, KL term not included, when u* acts from the
-                            recorded first state on in the surrogate models [b] (m2/s2)
+    predicted_cost_change   change of the running cost of the state after each step, KL term not included, when u*
+                            acts from the recorded first state on in the surrogate models [b, T] (m2/s2)
     """
 
     K: Array
@@ -57,13 +57,15 @@ class LqgModels:
     P_precision_P: Array
 
 
-def prepare(models: Models, kl_weight: float, variance_m2: float | None = None) -> LqgModels:
-    """Model table of the backward pass in single precision; `variance_m2` replaces the fitted S when given."""
+def prepare(
+    models: Models, kl_weight: float, variance_m2: float | None = None, dtype: type[np.floating] = np.float32
+) -> LqgModels:
+    """Model table of the backward pass, which has its precision; `variance_m2` replaces the fitted S when given."""
     fitted = models.variance if variance_m2 is None else np.full_like(models.variance, variance_m2)
     precision = kl_weight / np.maximum(fitted, ACTION_VARIANCE_FLOOR_M2)
     precision_P = precision[:, :, None] * models.P
     both = np.swapaxes(models.P, 1, 2) @ precision_P
-    return LqgModels(*(array.astype(np.float32) for array in (models.F, precision, precision_P, both)))
+    return LqgModels(*(array.astype(dtype) for array in (models.F, precision, precision_P, both)))
 
 
 def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Array, deviation: Array) -> Improvement:
@@ -77,7 +79,8 @@ def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Arra
     nu = deviation.shape[2]
     K = np.empty((count, length, nu, nx), dtype=models.F.dtype)
     k = np.empty((count, length, nu), dtype=models.F.dtype)
-    V = np.broadcast_to(hessian.astype(models.F.dtype), (count, nx, nx))
+    gradient, hessian, deviation = (array.astype(K.dtype, copy=False) for array in (gradient, hessian, deviation))
+    V = np.broadcast_to(hessian, (count, nx, nx))
     v = gradient[:, -1]
     for t in reversed(range(length)):
         F, pull = models.F[model[:, t]], models.precision[model[:, t]]
@@ -101,13 +104,13 @@ def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Arra
 
 
 def _predicted_change(models: LqgModels, model: Ints, gradient: Array, hessian: Array, K: Array, k: Array) -> Array:
-    """Forward pass: what the improved policy changes in the summed running cost, by the models."""
+    """Forward pass: what the improved policy changes in the running cost [b, T], by the models."""
     dx = np.zeros_like(gradient[:, 0])
-    change = np.zeros(len(gradient))
+    change = np.empty(gradient.shape[:2], dtype=gradient.dtype)
     for t in range(gradient.shape[1]):
         du = k[:, t] + (K[:, t] @ dx[:, :, None])[:, :, 0]
         dx = (models.F[model[:, t]] @ np.concatenate([dx, du], axis=1)[:, :, None])[:, :, 0]
-        change += ((gradient[:, t] + dx @ hessian / 2) * dx).sum(axis=1)
+        change[:, t] = ((gradient[:, t] + dx @ hessian / 2) * dx).sum(axis=1)
     return change
 
 

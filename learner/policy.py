@@ -1,4 +1,4 @@
-"""The policy network: fully connected, tanh between layers (paper Sec. IV-C), as a snapshot and as a torch module.
+"""The policy network: fully connected, tanh between layers (paper Sec. IV-C), as a snapshot and in torch.
 
 u = offset + scale * network(y)
 """
@@ -10,11 +10,16 @@ from itertools import pairwise
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 
 from t6gps.storage.records import PolicySnapshot
 
+Layers = Sequence[tuple[torch.Tensor, torch.Tensor]]
+
 FIRST_OUTPUT = 0.01
 """Size of the untrained network's output: the first policy holds the neutral shape and leaves motion to the noise."""
+ROWS = 4096
+"""Rows that pass the network at once: their activations stay in the cache."""
 
 
 def initial(
@@ -37,23 +42,32 @@ def initial(
     return PolicySnapshot(version=0, layers=cast, offset_m=offset_m, scale_m=scale_m)
 
 
-def module(snapshot: PolicySnapshot) -> torch.nn.Sequential:
-    """A trainable copy of the snapshot's network, without offset and scale."""
-    parts: list[torch.nn.Module] = []
+def parameters(snapshot: PolicySnapshot) -> tuple[torch.Tensor, Layers]:
+    """A copy of all weights and biases as one vector, and the (weight, bias) of each layer as views of it."""
+    vector = torch.from_numpy(np.concatenate([array.ravel() for layer in snapshot.layers for array in layer]))
+    layers, first = [], 0
     for weight, bias in snapshot.layers:
-        linear = torch.nn.Linear(weight.shape[1], weight.shape[0])
-        with torch.no_grad():
-            linear.weight.copy_(torch.tensor(weight))
-            linear.bias.copy_(torch.tensor(bias))
-        parts += [linear, torch.nn.Tanh()]
-    return torch.nn.Sequential(*parts[:-1])
+        middle, last = first + weight.size, first + weight.size + bias.size
+        layers.append((vector[first:middle].view(weight.shape), vector[middle:last]))
+        first = last
+    return vector, layers
 
 
-def snapshot(network: torch.nn.Sequential, *, version: int, offset_m: float, scale_m: float) -> PolicySnapshot:
-    """A copy of the network's weights as version `version`."""
-    layers = tuple(
-        (layer.weight.detach().numpy().copy(), layer.bias.detach().numpy().copy())
-        for layer in network
-        if isinstance(layer, torch.nn.Linear)
-    )
-    return PolicySnapshot(version=version, layers=layers, offset_m=offset_m, scale_m=scale_m)
+def activations(layers: Layers, inputs: torch.Tensor) -> list[torch.Tensor]:
+    """What enters each layer [n, width], the inputs first, and the network's output [n, nu] last."""
+    values = [inputs]
+    for number, (weight, bias) in enumerate(layers, 1):
+        value = torch.addmm(bias, values[-1], weight.t())
+        if number < len(layers):
+            # tanh z = 2 sigmoid(2 z) - 1, at a third of the time that torch takes for tanh
+            value.mul_(2).sigmoid_().mul_(2).sub_(1)
+        values.append(value)
+    return values
+
+
+def act(snapshot: PolicySnapshot, observations: NDArray[np.float32]) -> NDArray[np.float32]:
+    """Rest lengths [n, nu] (m) that the policy commands without noise, not clipped, for observations [n, ny]."""
+    _, layers = parameters(snapshot)
+    parts = [torch.tensor(observations[first : first + ROWS]) for first in range(0, len(observations), ROWS)]
+    network: NDArray[np.float32] = torch.cat([activations(layers, part)[-1] for part in parts]).numpy()
+    return np.float32(snapshot.offset_m) + np.float32(snapshot.scale_m) * network

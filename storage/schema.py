@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
 
-SCHEMA_VERSION = 1
+SCHEMA_VERSION = 2
+"""Grows with every change. Version 2 added columns at the end of `iterations` and `classes`; they are nullable,
+since the runs of version 1 have none."""
 OBSERVATION_N = 47
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction."""
 
@@ -123,6 +125,21 @@ ITERATIONS = _schema(
     _scalar("fitting_s", pa.float64(), "s", "duration"),
     _scalar("backward_pass_s", pa.float64(), "s", "duration"),
     _scalar("supervised_s", pa.float64(), "s", "duration"),
+    _scalar("supervised_loss_before", pa.float64(), "1", "the same error of the policy that sampled", nullable=True),
+    _scalar(
+        "policy_kl",
+        pa.float64(),
+        "nat",
+        "mean KL divergence of the new policy from the one that sampled",
+        nullable=True,
+    ),
+    _scalar(
+        "saturated_share",
+        pa.float64(),
+        "1",
+        "share of noise-free commands at an end of the command range",
+        nullable=True,
+    ),
 )
 
 CLASSES = _schema(
@@ -137,6 +154,23 @@ CLASSES = _schema(
     _scalar("pooled", pa.bool_(), "1", "too rare for models of its own: uses those pooled over its kind"),
     _scalar("modes", pa.float64(), "1", "mean number of modes per time step"),
     _scalar("residual", pa.float64(), "1", "mean residual of the assigned models in standard deviations"),
+    _scalar(
+        "cost", pa.float64(), "m2/s2", "mean running cost of the states that the class's steps lead to", nullable=True
+    ),
+    _scalar(
+        "predicted_cost_change",
+        pa.float64(),
+        "m2/s2",
+        "mean predicted change of that cost per step; null when every step is a jump",
+        nullable=True,
+    ),
+    _scalar(
+        "policy_kl",
+        pa.float64(),
+        "nat",
+        "mean KL divergence of the new policy from the one that sampled",
+        nullable=True,
+    ),
 )
 
 TABLES = {"frames": FRAMES, "episodes": EPISODES, "iterations": ITERATIONS, "classes": CLASSES}

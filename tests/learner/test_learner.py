@@ -10,8 +10,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import surrogate
-from t6gps.learner.features import NONE, Rows
+from t6gps.learner import policy, surrogate
+from t6gps.learner.cost import running_cost
+from t6gps.learner.features import NONE, Rows, read_rows
 from t6gps.learner.learner import Learner
 from t6gps.learner.modes import FitOptions
 from t6gps.learner.segments import cut, group
@@ -143,6 +144,71 @@ def test_the_report_fills_the_columns_of_its_tables(
     assert iteration["predicted_cost_change"] < 0 < iteration["action_change_m"]
 
 
+def test_the_report_of_an_iteration_is_the_mean_of_its_classes_over_their_rows(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner = make_learner()
+    iterate(learner, tables)
+    iteration, classes = learner.report()
+    episodes = read_rows(dict(enumerate(tables)), "nodes")
+    change = policy.act(learner.snapshot, episodes.observation).clip(0.65, 1.35) - episodes.action_mean
+    variance = np.nanmean((episodes.action - episodes.action_mean) ** 2)
+    assert iteration["policy_kl"] == pytest.approx(np.nanmean((change**2).sum(axis=1)) / 2 / variance, rel=1e-4)
+    weights = [row["rows"] for row in classes]
+    assert np.average([row["policy_kl"] for row in classes], weights=weights) == pytest.approx(iteration["policy_kl"])
+    # Jumps are no samples of the dynamics: a class's rows outnumber its predicted changes by them.
+    predicted = np.average([row["predicted_cost_change"] for row in classes], weights=weights)
+    assert predicted == pytest.approx(iteration["predicted_cost_change"], rel=0.05)
+    after = running_cost(episodes.state, episodes.target, 0.8, 0.1)[1:][episodes.acts[:-1]]
+    assert np.average([row["cost"] for row in classes], weights=weights) == pytest.approx(after.mean(), rel=1e-5)
+    assert 0 < iteration["supervised_loss"] < iteration["supervised_loss_before"]
+    assert iteration["saturated_share"] == 0.0
+
+
+def with_column(table: pa.Table, name: str, values: np.ndarray) -> pa.Table:
+    column = pa.array([*values, *[None] * (len(table) - len(values))], type=schema.FRAMES.field(name).type)
+    return table.set_column(schema.FRAMES.get_field_index(name), schema.FRAMES.field(name), column)
+
+
+def test_commands_at_an_end_of_the_range_count_as_saturated(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner, planted = make_learner(), []
+    for table in tables:
+        mean = schema.array(table, "action_mean").copy()
+        mean[:, :6], mean[:, 6:9] = np.float32(0.65), np.float32(1.35)
+        planted.append(with_column(table, "action_mean", mean))
+    iterate(learner, planted)
+    assert learner.report()[0]["saturated_share"] == pytest.approx(9 / 24)
+
+
+@pytest.mark.parametrize("deviation_from", ["recorded", "fitted"])
+def test_a_policy_without_noise_and_winches_at_their_limit_are_learned_from(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate, deviation_from: str
+) -> None:
+    """No exploration and constant commands: S has its floor and the slopes of these cables vanish."""
+    learner, planted = make_learner(deviation_from=deviation_from), []
+    for table in tables:
+        constant = np.full_like(schema.array(table, "action"), 1.35)
+        planted.append(with_column(with_column(table, "action", constant), "action_mean", constant))
+    iterate(learner, planted)
+    iteration, classes = learner.report()
+    assert all(np.isfinite(value) for row in [iteration, *classes] for value in row.values() if value is not None)
+    assert iteration["saturated_share"] == 1.0
+    assert iteration["action_change_m"] < 1e-3, "actions that were never varied have no known effect"
+
+
+def test_a_class_with_one_sample_is_learned_from(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner = make_learner(smallest_class_segments=1)
+    iterate(learner, tables[:2])
+    iteration, classes = learner.report()
+    assert min(row["rows"] for row in classes) == 1
+    assert np.isfinite(learner.state()[1]["replay_0_actions"]).all()
+    assert iteration["predicted_cost_change"] < 0
+
+
 BASE = {
     "reduced_state": "com", "longest_segment_steps": 3, "smallest_class_segments": 1000, "residual_threshold": 0.15,
 }  # fmt: skip
@@ -176,9 +242,7 @@ def test_the_cost_counts_states_after_a_step_towards_their_own_targets(
             target = schema.array(table, "target_direction").copy()
             if row is not None:
                 target[row] *= -1
-            field = schema.FRAMES.field("target_direction")
-            column = pa.array(list(target), type=field.type)
-            turned.append(table.set_column(schema.FRAMES.get_field_index(field.name), field, column))
+            turned.append(with_column(table, "target_direction", target))
         iterate(learner, turned)
         improved[row] = learner.state()[1]["replay_0_actions"].tobytes()
     assert improved[0] == improved[None] != improved[-1]

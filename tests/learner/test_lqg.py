@@ -107,10 +107,10 @@ def test_every_other_choice_of_actions_is_worse() -> None:
 def test_improved_actions_lower_the_predicted_cost_of_noise_free_trajectories() -> None:
     case = problem(deviation=0.0)
     improved = case.solve()
-    assert (improved.predicted_cost_change < 0).all()
+    assert (improved.predicted_cost_change.sum(axis=1) < 0).all()
     for b in range(B):
         change, _ = case.objective(b, case.closed_loop(b, improved))
-        assert change == pytest.approx(improved.predicted_cost_change[b], rel=1e-3)
+        assert change == pytest.approx(improved.predicted_cost_change[b].sum(), rel=1e-3)
 
 
 def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> None:
@@ -118,7 +118,7 @@ def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> N
     improved = case.solve()
     for b in range(B):
         change, _ = case.objective(b, case.closed_loop(b, improved))
-        assert change == pytest.approx(improved.predicted_cost_change[b], rel=1e-3, abs=1e-4)
+        assert change == pytest.approx(improved.predicted_cost_change[b].sum(), rel=1e-3, abs=1e-4)
 
 
 def test_a_heavy_kl_term_returns_the_policy_mean() -> None:
@@ -143,6 +143,30 @@ def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
     models = problem().models
     np.testing.assert_allclose(lqg.prepare(models, C, 0.04).precision, C / 0.04)
     np.testing.assert_allclose(lqg.prepare(models, C, 0.0).precision, C / 1e-4)
+
+
+@pytest.mark.parametrize("variance", [0.02, 0.0])
+def test_single_precision_equals_double_precision_to_four_digits(variance: float) -> None:
+    """At the robot's size: 39 states, 24 actions, 10 steps; also for a policy without noise, whose S has its floor."""
+    nx, nu, length, b = 39, 24, 10, 20
+    rng = np.random.default_rng(0)
+    F = rng.normal(0, 0.13, (b, nx, nx + nu))  # spectral radius about 0.8
+    F[:, -3:] = -F[:, -6:-3]  # dependent rows, as of nodes about the centre of mass
+    P = rng.normal(0, 0.1, (b, nu, nx))
+    models = Models(F, np.zeros((b, nx)), P, np.zeros((b, nu)), np.full((b, nu), 0.02))
+    model = rng.integers(0, b, (b, length))
+    target = rng.normal(size=(b, length, 2))
+    target /= np.linalg.norm(target, axis=2, keepdims=True)
+    gradient = cost.gradient(rng.normal(0, 0.5, (b, length, nx)), target, 0.8, 0.1)
+    deviation = rng.normal(0, np.sqrt(variance), (b, length, nu))
+    single, double = (
+        lqg.backward_pass(lqg.prepare(models, 0.02, variance, dtype), model, gradient, cost.hessian(nx, 0.1), deviation)
+        for dtype in (np.float32, np.float64)
+    )
+    for name in ("K", "k", "predicted_cost_change"):
+        one, other = getattr(single, name), getattr(double, name)
+        assert one.dtype == np.float32 and other.dtype == np.float64
+        assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), name
 
 
 @pytest.mark.parametrize("horizon", [1, 7, 10, 1000])

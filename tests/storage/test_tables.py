@@ -50,6 +50,26 @@ def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, rows: Any)
     assert tables.read(run, "classes").to_pylist() == class_rows(0) + class_rows(1)
 
 
+def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_and_can_go_on(
+    run: Run, make_episode: Any, commit: Any, rows: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    later = {"iterations": 3, "classes": 3}
+    with monkeypatch.context() as past:
+        first = {name: pa.schema(list(schema.TABLES[name])[:-n]) for name, n in later.items()}
+        past.setattr(schema, "TABLES", schema.TABLES | first)
+        make_row, make_classes = rows
+        row = {key: value for key, value in make_row(0).items() if key in first["iterations"].names}
+        classes = [{k: v for k, v in c.items() if k in first["classes"].names} for c in make_classes(0)]
+        tables.commit_iteration(run, 0, [make_episode(0, 0)], row, classes)
+    commit(run, 1)
+    for name, n in later.items():
+        table = tables.read(run, name).sort_by("iteration")
+        for column in schema.TABLES[name].names[-n:]:
+            values = table.column(column).to_pylist()
+            assert values[0] is None and values[-1] is not None
+        assert table.column("cost" if name == "iterations" else "residual").null_count == 0
+
+
 def test_columns_and_rows_can_be_chosen(run: Run, commit: Any) -> None:
     commit(run, 0)
     commit(run, 1)
