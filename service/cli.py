@@ -22,6 +22,7 @@ from t6gps.service import bench as benchmarks
 from t6gps.service import config as configuration
 from t6gps.service import display, evaluation, operate, run
 from t6gps.service.config import Config
+from t6gps.service.diagnosis import diagnose
 from t6gps.service.display import console
 from t6gps.service.executor import Executor
 from t6gps.service.operate import DEFAULT_ROOT, Json, Root, RunName
@@ -184,7 +185,7 @@ def runs(root: Root = DEFAULT_ROOT) -> None:
 
 @app.command()
 def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
-    """Show a run: learning curve, segment classes of the last iteration, evaluation, files."""
+    """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
     this = catalog.open_run(root, run_name)
     if not tables.committed_iterations(this):
         typer.echo(f"run {run_name} has not finished an iteration yet")
@@ -194,6 +195,8 @@ def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
     last = max((row["iteration"] for row in classes), default=-1)
     rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
     display.print_rows(f"Segment classes of iteration {last}", rows, display.CLASS_COLUMNS)
+    iterations = tables.read(this, "iterations").to_pylist()
+    typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
     result = evaluation.kept(this)
     if result:
         display.print_evaluation(result)

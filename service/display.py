@@ -56,6 +56,9 @@ CLASS_COLUMNS = {
     "pooled": ("pooled", "{}"),
     "modes": ("modes", "{:.2f}"),
     "residual": ("residual", "{:.2f}"),
+    "cost": ("cost", "{:.3f}"),
+    "predicted_cost_change": ("predicted change", "{:.3f}"),
+    "policy_kl": ("KL nat", "{:.2f}"),
 }
 
 

@@ -84,7 +84,7 @@ def test_query_gives_the_same_rows_in_every_format(root: Path) -> None:
 def test_runs_and_show_describe_the_run(root: Path) -> None:
     assert "2 of 2" in t6gps("runs", root=root).stdout.decode()
     printed = t6gps("show", "tiny", root=root).stdout.decode()
-    for word in ("Segment classes", "Lambda", "Noise-free policy", "dataset"):
+    for word in ("Segment classes", "Lambda", "Diagnosis:", "Noise-free policy", "dataset"):
         assert word in printed
 
 
