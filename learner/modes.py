@@ -157,17 +157,23 @@ def _standardise(samples: Array, state_n: int, prior: Moments, options: FitOptio
     regressor_n = samples.shape[1] - state_n
     pooled_scale = np.sqrt(prior.covariance.diagonal())
     pooled_scale = np.where(pooled_scale > 1e-9, pooled_scale, 1.0)
-    share = np.full(state_n, (1 - COST_STATE_SHARE) / max(state_n - VELOCITY_N, 1))
-    share[:VELOCITY_N] = (COST_STATE_SHARE if state_n > VELOCITY_N else 1.0) / VELOCITY_N
     # A bin in which an entry hardly varies must not turn rounding into outliers.
     spread = np.maximum(samples[:, regressor_n:].std(axis=0), 1e-3 * pooled_scale[regressor_n:])
-    unit = np.concatenate([pooled_scale[:regressor_n], spread / np.sqrt(share)])
+    unit = np.concatenate([pooled_scale[:regressor_n], residual_unit(spread)])
     centre = samples.mean(axis=0)
     a, pooled = (samples - centre) / unit, prior.covariance / np.outer(unit, unit)
     # A pool of hardly more samples than regressors determines nothing: its slopes fade out, steeply.
     ridge = options.ridge + (regressor_n / prior.count) ** 4
     departure = a[:, regressor_n:] - a[:, :regressor_n] @ _slopes(pooled, regressor_n, ridge)
     return _Bin(a, centre, unit, pooled, ridge, state_n, departure, options)
+
+
+def residual_unit(spread: Array) -> Array:
+    """Units of x' [nx] in which the norm of an error is its residual, from standard deviations [nx]."""
+    share = np.full(len(spread), (1 - COST_STATE_SHARE) / max(len(spread) - VELOCITY_N, 1))
+    share[:VELOCITY_N] = (COST_STATE_SHARE if len(spread) > VELOCITY_N else 1.0) / VELOCITY_N
+    unit: Array = spread / np.sqrt(share)
+    return unit
 
 
 def _slopes(covariance: Array, regressor_n: int, ridge: float) -> Array:

@@ -12,7 +12,11 @@ from typing import Any
 
 from t6gps.storage.errors import ConfigError
 
-BENCHMARKS = {"physics": "t6gps.workers.benchmarks", "soundness": "t6gps.workers.soundness"}
+BENCHMARKS = {
+    "learner": "t6gps.service.learning_benchmark",
+    "physics": "t6gps.workers.benchmarks",
+    "soundness": "t6gps.workers.soundness",
+}
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
@@ -22,8 +26,9 @@ def measure(name: str) -> dict[str, Any]:
         close = difflib.get_close_matches(name, BENCHMARKS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
-    run: Callable[[], dict[str, float]] = getattr(importlib.import_module(BENCHMARKS[name]), name)
-    return {"bench": name, "commit": _commit(), "threads": 1, "results": run()}
+    module = importlib.import_module(BENCHMARKS[name])
+    run: Callable[[], dict[str, float]] = getattr(module, name)
+    return {"bench": name, "commit": _commit(), "threads": getattr(module, "THREADS", 1), "results": run()}
 
 
 def _commit() -> str:
