@@ -91,6 +91,13 @@ EPISODES = _schema(
     _scalar("cost", pa.float64(), "m2/s2", "mean running cost over rows 1 .. T"),
     _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "mean forward speed over rows 1 .. T"),
     _scalar("stuck_share", pa.float64(), "1", "share of rows 1 .. T with a speed below 0.05 m/s"),
+    _scalar(
+        "stuck_share_by_distance",
+        pa.float64(),
+        "1",
+        "share of rows 10 .. T less than 0.05 m from the place of 1 s before; null for T < 10",
+        nullable=True,
+    ),
     _scalar("waypoints_reached", pa.int32(), "1", "waypoints reached"),
     _scalar("path_length_m", pa.float64(), "m", "length of the horizontal path of the centre of mass"),
     _scalar("transitions", pa.int32(), "1", "changes of the support triangle"),

@@ -96,7 +96,9 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         self._episode = None  # a start that fails leaves none
         settings = self._settings
         nominal_m = nominal_rest_length(settings.robot)
-        episode = RunningEpisode(self._simulation, settings, seed, terrain_seed, settings.terrain.difficulty, nominal_m)
+        episode = RunningEpisode(
+            self._simulation, settings, seed, terrain_seed, settings.terrain.difficulty, nominal_m, number=seed
+        )
         self._episode = episode
         return episode.observation, {"seed": seed, "terrain_seed": terrain_seed, **_info(episode)}
 

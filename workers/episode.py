@@ -12,9 +12,9 @@ from t6gps.workers.ground import ground
 from t6gps.workers.observer import observe, survey
 from t6gps.workers.physics import CONTROL_STEP_S, Simulation
 from t6gps.workers.settings import RolloutSettings
-from t6gps.workers.start import random_start
+from t6gps.workers.start import random_start, rest_start
 from t6gps.workers.support import SupportFrame, enter
-from t6gps.workers.task import Course, random_waypoints
+from t6gps.workers.task import Course, one_direction, random_waypoints
 
 
 class RunningEpisode:
@@ -27,7 +27,8 @@ class RunningEpisode:
     noise_rng                 the stream for exploration; start and course have streams of their own
 
     Observed rest lengths are centred on `nominal_m`, the policy's own, whatever robot it meets. Commands act
-    `delay_steps` control steps after they are given; until then the winches hold. Raises PhysicsError if the robot
+    `delay_steps` control steps after they are given; until then the winches hold. `number` chooses among the
+    directions of the task if it has any. Raises PhysicsError if the robot
     cannot even start, TerrainError if there is no such ground.
     """
 
@@ -40,6 +41,7 @@ class RunningEpisode:
         terrain_difficulty: float,
         nominal_m: float,
         delay_steps: int = 0,
+        number: int = 0,
     ) -> None:
         robot, task = settings.robot, settings.task
         start_rng, course_rng, self.noise_rng = np.random.default_rng(seed).spawn(3)
@@ -48,8 +50,13 @@ class RunningEpisode:
         self._simulation = simulation
         self._nominal_m = nominal_m
         self._step = 0
-        self.state = random_start(simulation, robot, terrain, start_rng)
-        self.course = Course(random_waypoints(course_rng, self.state.com[:2], task), task)
+        if task.directions:
+            self.state = rest_start(simulation, robot)
+            waypoints = one_direction(number, self.state.com[:2], task.directions)
+        else:
+            self.state = random_start(simulation, robot, terrain, start_rng)
+            waypoints = random_waypoints(course_rng, self.state.com[:2], task)
+        self.course = Course(waypoints, task)
         self._delayed = deque([self.state.rest_lengths] * delay_steps)
         self._look(None)
 

@@ -21,6 +21,8 @@ from t6gps.workers.task import running_cost
 
 Array = NDArray[np.float64]
 STUCK_SPEED_M_PER_S = 0.05
+STUCK_DISTANCE_M, STUCK_STEPS = 0.05, round(1.0 / CONTROL_STEP_S)
+"""Stuck by distance: less than this far from where the centre of mass was one second before."""
 
 
 @dataclass
@@ -124,6 +126,7 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
         "cost": float(cost[moved].mean()),
         "forward_speed_m_per_s": float(forward_speed[moved].mean()),
         "stuck_share": float((speed[moved] < STUCK_SPEED_M_PER_S).mean()),
+        "stuck_share_by_distance": stuck_share_by_distance(com),
         "waypoints_reached": outcome.waypoints_reached,
         "path_length_m": float(path),
         "transitions": sum(a.face != b.face for a, b in pairwise(frames)),
@@ -137,6 +140,17 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
         pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
         pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
     )
+
+
+def stuck_share_by_distance(com: Array) -> float | None:
+    """Share of places [T + 1, 3] (m) less than 0.05 m from the one 1 s before; None for a path shorter than that.
+
+    A robot that rocks on the spot has speed but gets nowhere.
+    """
+    if len(com) <= STUCK_STEPS:
+        return None
+    distance = np.linalg.norm(com[STUCK_STEPS:] - com[:-STUCK_STEPS], axis=1)
+    return float((distance < STUCK_DISTANCE_M).mean())
 
 
 def _stacked(rows: list[NDArray[Any]]) -> NDArray[Any]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -30,8 +32,40 @@ def rollout(
     or the range of sound states ends there and says why in `ended_by`; PhysicsError if it does so at once. An empty
     `record` of the caller's is filled as the episode goes: it shows how far one came that failed.
     """
+
+    def control(episode: RunningEpisode, _: int) -> NDArray[np.float32]:
+        return policy.act(snapshot, episode.observation)
+
+    return controlled(simulation, settings, plan, control, snapshot.version, snapshot.offset_m, delay_steps, record)
+
+
+Controller = Callable[[RunningEpisode, int], NDArray[np.floating]]
+"""Canonical rest lengths [24] (m) to command in an episode at a step, before exploration noise."""
+
+
+def controlled(
+    simulation: Simulation,
+    settings: RolloutSettings,
+    plan: EpisodePlan,
+    control: Controller,
+    version: int,
+    nominal_m: float,
+    delay_steps: int = 0,
+    record: Record | None = None,
+) -> Episode:
+    """Run the episode that `plan` describes under any controller; `rollout` says the rest.
+
+    `version` goes into the tables as the policy's, observed rest lengths are centred on `nominal_m`.
+    """
     episode = RunningEpisode(
-        simulation, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, snapshot.offset_m, delay_steps
+        simulation,
+        settings,
+        plan.seed,
+        plan.terrain_seed,
+        plan.terrain_difficulty,
+        nominal_m,
+        delay_steps,
+        plan.index,
     )
     noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
@@ -39,9 +73,9 @@ def rollout(
     record = Record() if record is None else record
     _keep(record, episode)
     ended_by = "completed"
-    for _ in range(plan.steps):
+    for step in range(plan.steps):
         frame = episode.frame
-        mean = policy.act(snapshot, episode.observation)
+        mean = control(episode, step)
         mean = np.minimum(np.maximum(mean, shortest_m), longest_m)
         command = np.minimum(np.maximum(mean[CABLE_MAP[frame.element]] + next(noise), shortest_m), longest_m)
         try:
@@ -53,9 +87,9 @@ def rollout(
             ended_by = error.reason
             break
         record.means.append(mean)
-        record.actions.append(_canonical_action(command, frame))
+        record.actions.append(canonical_action(command, frame))
         _keep(record, episode)
-    outcome = Outcome(snapshot.version, ended_by, episode.course.reached, delay_steps)
+    outcome = Outcome(version, ended_by, episode.course.reached, delay_steps)
     return to_episode(record, plan, outcome, settings)
 
 
@@ -67,7 +101,8 @@ def _keep(record: Record, episode: RunningEpisode) -> None:
     record.observations.append(episode.observation)
 
 
-def _canonical_action(command: NDArray[np.float64], frame: SupportFrame) -> NDArray[np.float64]:
+def canonical_action(command: NDArray[np.float64], frame: SupportFrame) -> NDArray[np.float64]:
+    """Commands [24] of the cables in world labels, relabelled for the frame."""
     action = np.empty_like(command)
     action[CABLE_MAP[frame.element]] = command
     return action

@@ -46,6 +46,12 @@ class TaskSettings(Settings):
     nearest_waypoint_m: float = Field(2.0, gt=0.0, le=20.0, description="least distance between waypoints (m)")
     farthest_waypoint_m: float = Field(4.0, gt=0.0, le=20.0, description="largest distance between waypoints (m)")
     waypoint_timeout_s: float = Field(5.0, gt=0.0, le=1000.0, description="the next waypoint comes after this time (s)")
+    directions: int = Field(
+        0,
+        ge=0,
+        le=360,
+        description="0: random starts and waypoints; J > 0: one rest state, episode i heads for direction i modulo J",
+    )
     target_speed_m_per_s: float = Field(0.8, gt=0.0, le=5.0, description="v* of the cost (m/s)")
     vertical_weight: float = Field(0.1, gt=0.0, le=1.0, description="weight of the vertical velocity in the cost")
 
@@ -81,3 +87,12 @@ class RolloutSettings(Settings):
     task: TaskSettings = TaskSettings()
     exploration: ExplorationSettings = ExplorationSettings()
     randomisation: RandomisationSettings = RandomisationSettings()
+
+    @model_validator(mode="after")
+    def _rest_on_flat_ground(self) -> "RolloutSettings":
+        ground = self.terrain
+        if self.task.directions and (ground.difficulty > 0 or ground.tilt_deg > 0 or ground.file):
+            raise ValueError(
+                "task.directions starts from rest on flat ground: terrain.difficulty and tilt_deg must be 0"
+            )
+        return self

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from contextlib import suppress
 from dataclasses import replace
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +21,8 @@ SHAPE_SPREAD_M = 0.15
 """Initial rest lengths are uniform within this distance of the nominal one."""
 CLEARANCE_M = 0.05
 SETTLE_STEPS = 15
-CHECK_STEPS = 25
+CHECK_STEPS, REST_STEPS = 25, 100
+"""After 100 control steps no bar moves faster than 2 mm/s."""
 REDRAWN_STARTS_N = 9
 COLLAPSED_M = 0.6
 """Lowest CoM of a standing robot; it is 0.89 m in the neutral shape, and 0.46 m or less once the shape is lost."""
@@ -56,6 +58,31 @@ def _fall(
     return state
 
 
+def rest_start(simulation: Simulation, robot: RobotSettings) -> RobotState:
+    """Put the robot into the one rest state on flat ground: in its neutral shape, on one Delta above the origin."""
+    state = _rest_state(robot)
+    simulation.reset(state)
+    return state
+
+
+@lru_cache(maxsize=8)
+def _rest_state(robot: RobotSettings) -> RobotState:
+    with Simulation(robot) as simulation:
+        return _settled(simulation, robot, REST_STEPS)
+
+
+def _settled(simulation: Simulation, robot: RobotSettings, steps: int) -> RobotState:
+    """The robot after `steps` control steps on a Delta of flat ground, its winches holding the neutral shape."""
+    corners = NODES_M[FACES[0]]
+    down = corners.mean(axis=0) / np.linalg.norm(corners.mean(axis=0))
+    quaternion = np.array([*np.cross(down, [0.0, 0.0, -1.0]), 1 - down[2]])
+    turned = turn(neutral_state(robot), quaternion / np.linalg.norm(quaternion))
+    simulation.reset(turned)
+    for _ in range(steps):
+        state = simulation.control_step(turned.rest_lengths)
+    return state
+
+
 def check_stance(robot: RobotSettings) -> None:
     """Let the robot settle on a Delta of flat ground for 2.5 s, its winches holding the neutral shape.
 
@@ -68,13 +95,8 @@ def check_stance(robot: RobotSettings) -> None:
             f"{robot.cable_stiffness_n_per_m} need rest lengths of {nominal_m:.3f} m at the neutral shape; allowed: "
             f"commands from {robot.shortest_command_m} to {robot.longest_command_m} m; change one of the four"
         )
-    corners = NODES_M[FACES[0]]
-    down = corners.mean(axis=0) / np.linalg.norm(corners.mean(axis=0))
-    quaternion = np.array([*np.cross(down, [0.0, 0.0, -1.0]), 1 - down[2]])
     with Simulation(robot) as simulation:
-        simulation.reset(turn(neutral_state(robot), quaternion / np.linalg.norm(quaternion)))
-        for _ in range(CHECK_STEPS):
-            state = simulation.control_step(np.full(CABLES_N, nominal_m))
+        state = _settled(simulation, robot, CHECK_STEPS)
     if state.com[2] < COLLAPSED_M:
         raise PhysicsError(
             f"with these settings of the robot its stance collapses: the CoM settles at {state.com[2]:.2f} m, below "

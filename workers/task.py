@@ -18,6 +18,9 @@ WAYPOINT_RADIUS_M = float(np.linalg.norm(NODES_M[0]))
 AREA_HALF_WIDTH_M = 15.0
 """Waypoints lie within this distance of the origin along x and along y, away from the edge of the ground."""
 
+FAR_WAYPOINT_M = 1000.0
+"""So far that its direction stays the same during an episode."""
+
 
 def random_waypoints(rng: np.random.Generator, start: Array, settings: TaskSettings) -> Array:
     """A chain of waypoints [n, 2] (m) from `start` [2], in random directions, all within the area."""
@@ -32,6 +35,13 @@ def random_waypoints(rng: np.random.Generator, start: Array, settings: TaskSetti
             inside = bool(np.abs(waypoints[i]).max() <= AREA_HALF_WIDTH_M)
         place = waypoints[i]
     return waypoints
+
+
+def one_direction(number: int, start: Array, directions: int) -> Array:
+    """A single waypoint [1, 2] (m) far from `start` [2] in direction `number` modulo `directions`, counted from +x."""
+    angle = 2 * np.pi * (number % directions) / directions
+    waypoint: Array = start + FAR_WAYPOINT_M * np.array([[np.cos(angle), np.sin(angle)]])
+    return waypoint
 
 
 class Course:

@@ -17,7 +17,7 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import policy
 from t6gps.workers.exploration import noise
 from t6gps.workers.physics import Simulation
-from t6gps.workers.recording import canonical_vectors
+from t6gps.workers.recording import canonical_vectors, stuck_share_by_distance
 from t6gps.workers.settings import RolloutSettings, TaskSettings
 from t6gps.workers.start import SETTLE_STEPS
 from t6gps.workers.state import Array, RobotState
@@ -156,8 +156,35 @@ def test_the_summary_agrees_with_the_frames(flat: Episode) -> None:
     for name in ("cost", "forward_speed_m_per_s"):
         assert summary[name] == pytest.approx(float(np.mean(schema.array(moved, name))))
     assert summary["stuck_share"] == np.mean(schema.array(moved, "speed_m_per_s") < 0.05)
+    places = np.column_stack([schema.array(flat.frames, f"com_{axis}_m") for axis in "xyz"])
+    expected = [np.linalg.norm(places[t] - places[t - 10]) < 0.05 for t in range(10, len(places))]
+    assert summary["stuck_share_by_distance"] == np.mean(expected)
     assert summary["steps"] == PLAN.steps
     assert summary["ended_by"] == "completed"
+
+
+def test_rocking_on_the_spot_is_stuck_by_distance_and_rolling_is_not() -> None:
+    steps = np.arange(61)[:, None]
+    rocking = np.hstack([0.1 * np.sin(2 * np.pi * steps / 10), 0 * steps, 0 * steps])
+    rolling = np.hstack([0.05 * steps, 0 * steps, 0 * steps])
+    assert stuck_share_by_distance(rocking) == 1.0
+    assert stuck_share_by_distance(rolling) == 0.0
+    assert stuck_share_by_distance(np.vstack([rocking, rolling[1:]])) == pytest.approx(51 / 111, abs=0.03)
+    assert stuck_share_by_distance(rolling[:10]) is None
+
+
+def test_with_directions_every_episode_starts_at_the_same_rest_and_heads_one_way() -> None:
+    settings = RolloutSettings(task=TaskSettings(directions=4))
+    worker, policy = RolloutWorker(settings), random_policy()
+    episodes = [worker.run(replace(PLAN, steps=3, seed=10 + i, index=i), policy).frames for i in range(5)]
+    worker.close()
+    starts = [np.concatenate([schema.array(e, n)[0] for n in ("bar_positions", "bar_orientations")]) for e in episodes]
+    for start in starts:
+        np.testing.assert_array_equal(start, starts[0])
+    assert np.abs(schema.array(episodes[0], "bar_velocities")[0]).max() < 0.02
+    assert {e["kind"][0].as_py() for e in episodes} == {0}
+    ways = [[e[f"waypoint_{axis}_m"][0].as_py() - e[f"com_{axis}_m"][0].as_py() for axis in "xy"] for e in episodes]
+    np.testing.assert_allclose(np.array(ways) / 1000, [[1, 0], [0, 1], [-1, 0], [0, -1], [1, 0]], atol=1e-9)
 
 
 def test_a_policy_that_does_not_fit_is_refused(worker: RolloutWorker) -> None:
