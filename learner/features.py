@@ -41,6 +41,7 @@ class Rows:
     acts          the row has an action [n]
     continues     the transition to the next row is a sample of the dynamics [n]: not after the last row of an
                   episode, nor over a jump between triangles without a common edge
+    labels        canonical label of each entry of an action [n, nu] where actions are not canonical, else None
     """
 
     state: NDArray[np.float32]
@@ -54,6 +55,7 @@ class Rows:
     starts: NDArray[np.bool_]
     acts: NDArray[np.bool_]
     continues: NDArray[np.bool_]
+    labels: NDArray[np.int64] | None = None
 
     @property
     def samples(self) -> NDArray[np.float32]:
@@ -67,26 +69,14 @@ def read_rows(episodes: Mapping[int, pa.Table], reduced_state: ReducedState) -> 
     Raises DataError when there is no episode, when an episode has anything but one row without an action (its
     last), when no episode has a control step, or when a triangle is left that stays the same.
     """
-    if not episodes:
-        raise DataError("the learner has no episodes; add at least one before it cuts segments")
-    tables = [episodes[key] for key in sorted(episodes)]
-    for key, table in episodes.items():
-        nulls = table.column("action").null_count
-        if nulls != 1 or table.column("action")[-1].is_valid:
-            raise DataError(f"episode {key}: only the last row may lack an action, found {nulls} null actions")
-    ends = np.cumsum([table.num_rows for table in tables])
-    acts = np.ones(ends[-1], dtype=bool)
-    acts[ends - 1] = False
-    if not acts.any():
-        raise DataError(f"none of the {len(tables)} episodes has a single control step; there is nothing to learn from")
-
+    tables, acts, first = acting_rows(episodes)
     table = pa.concat_tables([table.select(_columns(reduced_state)) for table in tables])
     face, exit_ = schema.array(table, "face").astype(np.int64), _edges(table, "exit_edge")
     changes = face[1:] != face[:-1]
     if (exit_[:-1][~changes & acts[:-1]] != NONE).any():
         raise DataError("a row has an exit_edge although `face` stays the same; the worker's record is inconsistent")
-    starts = np.ones(len(acts), dtype=bool)
-    starts[1:] = changes | ~acts[:-1]
+    starts = first.copy()
+    starts[1:] |= changes
     continues = acts.copy()
     continues[:-1] &= ~changes | (exit_[:-1] != NONE)
     kind = schema.array(table, "kind").astype(np.int64)
@@ -103,6 +93,29 @@ def read_rows(episodes: Mapping[int, pa.Table], reduced_state: ReducedState) -> 
         acts=acts,
         continues=continues,
     )
+
+
+def acting_rows(
+    episodes: Mapping[int, pa.Table],
+) -> tuple[list[pa.Table], NDArray[np.bool_], NDArray[np.bool_]]:
+    """Tables of the episodes in ascending order of their ids, and which rows act and which are first [n].
+
+    DataError as for `read_rows`.
+    """
+    if not episodes:
+        raise DataError("the learner has no episodes; add at least one before it cuts segments")
+    tables = [episodes[key] for key in sorted(episodes)]
+    for key, table in episodes.items():
+        nulls = table.column("action").null_count
+        if nulls != 1 or table.column("action")[-1].is_valid:
+            raise DataError(f"episode {key}: only the last row may lack an action, found {nulls} null actions")
+    ends = np.cumsum([table.num_rows for table in tables])
+    acts = np.ones(ends[-1], dtype=bool)
+    acts[ends - 1] = False
+    if not acts.any():
+        raise DataError(f"none of the {len(tables)} episodes has a single control step; there is nothing to learn from")
+    first = np.concatenate([[True], ~acts[:-1]])
+    return tables, acts, first
 
 
 _PARTS: dict[ReducedState, Sequence[str]] = {

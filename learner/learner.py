@@ -19,12 +19,12 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg, policy, report, supervised, surrogate
+from t6gps.learner import cost, localization, lqg, policy, report, standard_gps, supervised, surrogate
 from t6gps.learner.features import Rows, read_rows
 from t6gps.learner.modes import FitOptions
 from t6gps.learner.report import Fitted, Improved, Segmented, Trained, root_mean_square
 from t6gps.learner.segments import cut, group
-from t6gps.learner.settings import LearnerSettings
+from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage import schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError
 from t6gps.storage.records import PolicySnapshot
@@ -38,6 +38,8 @@ Phase = TypeVar("Phase")
 
 LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM = 1, 1, 2
 """Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy)."""
+SEGMENTED = (Localization.SEGMENTS, Localization.TIME)
+"""Localizations that fit the models of segment classes; the others leave the table `classes` empty."""
 CHUNK = 256
 """Sub-trajectories solved at once: their matrices stay in the cache. Chunks do not depend on each other, so they run on
 all cores, which the workers leave idle while the learner works, with the same result."""
@@ -51,6 +53,7 @@ class Learner:
     vertical_weight        weight of the vertical velocity in the cost
     command_range_m        improved actions are clipped to it
     offset_m, scale_m      u = offset + scale * network
+    world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
     fit_map                applies a pure function to jobs and returns the results in their order; `map` or a
                            pool
     """
@@ -65,6 +68,7 @@ class Learner:
         command_range_m: tuple[float, float],
         offset_m: float,
         scale_m: float,
+        world_labels: NDArray[np.int64],
         fit_map: FitMap = map,
     ) -> None:
         self._settings = settings
@@ -72,6 +76,7 @@ class Learner:
         self._target_speed_m_per_s = target_speed_m_per_s
         self._vertical_weight = vertical_weight
         self._command_range_m = command_range_m
+        self._world_labels = world_labels
         self._fit_map = fit_map
         action_n = schema.vector_length(schema.FRAMES.field("action"))
         assert action_n is not None
@@ -107,12 +112,16 @@ class Learner:
 
     def segment(self) -> Iterator[tuple[int, int]]:
         """Cut the episodes into segments and classify them (lines 3 to 5); the learner lets go of their tables."""
-        rows = read_rows(self._episodes, self._settings.reduced_state)
+        if self._settings.localization is Localization.TIME:
+            rows = standard_gps.read_rows(self._episodes, self._world_labels)
+        else:
+            rows = read_rows(self._episodes, self._settings.reduced_state)
         self._episodes.clear()
         self._fitted = self._improved = self._trained = None
         yield 1, 2
         segments = cut(rows, self._settings.longest_segment_steps)
-        groups = group(segments, self._settings.smallest_class_segments)
+        segmented = self._settings.localization in SEGMENTED
+        groups = group(segments, self._settings.smallest_class_segments) if segmented else []
         self._segmented = Segmented(rows, segments, groups)
         yield 2, 2
 
@@ -120,8 +129,14 @@ class Learner:
         """Fit the local models of every class (line 6)."""
         data = _of(self._segmented, "segment")
         settings = self._settings
-        options = FitOptions(settings.modes, settings.residual_threshold, settings.prior_samples, settings.ridge)
-        jobs = surrogate.jobs(data.rows, data.segments, data.groups, options, self._run_seed, self.snapshot.version)
+        options = FitOptions(
+            settings.modes, settings.residual_threshold, settings.prior_samples, settings.ridge, settings.mode_search
+        )
+        seeds = self._run_seed, self.snapshot.version
+        if settings.localization in SEGMENTED:
+            jobs = surrogate.jobs(data.rows, data.segments, data.groups, options, *seeds)
+        else:
+            jobs = localization.jobs(data.rows, settings.localization, options, *seeds)
         if not jobs:
             raise DataError("no transition of this iteration can be learned from: every step ends in a jump")
         fits = {}
@@ -174,13 +189,16 @@ class Learner:
     def supervise(self) -> Iterator[tuple[int, int]]:
         """Train the policy on this iteration's pairs and the replayed ones (line 13)."""
         rows, improved = _of(self._segmented, "segment").rows, _of(self._improved, "backward_pass")
-        pairs = rows.observation[rows.continues], improved.action[rows.continues]
+        learned = improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
+        pairs = rows.observation[rows.continues], learned[rows.continues]
         observations, actions = (np.concatenate(part) for part in zip(*self._replayed, pairs, strict=True))
         rng = self._rng(self.snapshot.version, SUPERVISED_STREAM)
         training = supervised.train(self.snapshot, observations, actions, self._settings, rng)
         self.snapshot, loss = yield from training
         self._replayed.append(pairs)
         mean = np.clip(policy.act(self.snapshot, rows.observation), *self._command_range_m)
+        if rows.labels is not None:
+            mean = standard_gps.to_world(mean, rows.labels)
         self._trained = Trained(loss, mean)
 
     def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:

@@ -29,7 +29,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.learner import mixtures
 from t6gps.learner.features import VELOCITY_N
+from t6gps.learner.settings import ModeSearch
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -74,6 +76,7 @@ class FitOptions:
     residual_threshold: float
     prior_samples: float
     ridge: float
+    search: ModeSearch = ModeSearch.RANSAC
 
 
 def moments(samples: Array) -> Moments:
@@ -97,7 +100,21 @@ def fit_modes(
     half. Source: paper Sec. III-E.
     """
     bin_ = _standardise(samples, state_n, prior, options)
-    remaining, modes = np.arange(len(samples)), []
+    modes = _recursive(bin_, rng) if options.search is ModeSearch.RANSAC else _mixture(bin_, rng)
+    best, residual = _assign(bin_, modes)
+    return stack([_in_units(bin_, mode) for mode in modes]), best, residual
+
+
+def _mixture(bin_: _Bin, rng: np.random.Generator) -> list[_Mode]:
+    """Modes from the components of a Gaussian mixture."""
+    options = bin_.options
+    rows = mixtures.components(bin_.a, bin_.pooled, options.modes, options.prior_samples, bin_.ridge, rng)
+    return [_fit(bin_, own, len(own)) for own in rows]
+
+
+def _recursive(bin_: _Bin, rng: np.random.Generator) -> list[_Mode]:
+    """Modes by recursive RANSAC: each is fitted to the outliers of the one before."""
+    options, remaining, modes = bin_.options, np.arange(len(bin_.a)), list[_Mode]()
     while True:
         modes.append(mode := _consensus(bin_, remaining, rng))
         outliers = remaining[_residuals(bin_, mode, remaining) >= options.residual_threshold]
@@ -111,8 +128,7 @@ def fit_modes(
         inlier = residual < options.residual_threshold
         own = [np.flatnonzero(inlier & (best == number)) for number in range(len(modes))]
         modes = [_fit(bin_, rows, len(rows)) for rows in own if len(rows)] or modes
-    best, residual = _assign(bin_, modes)
-    return stack([_in_units(bin_, mode) for mode in modes]), best, residual
+    return modes
 
 
 def _assign(bin_: _Bin, modes: Sequence[_Mode]) -> tuple[Ints, Array]:

@@ -1,10 +1,34 @@
 """Settings of the C-step and the S-step; defaults and their grounds are in docs/algorithm.md."""
 
+from enum import StrEnum
 from typing import Annotated, Literal
 
 from pydantic import Field
 
 from t6gps.storage.settings import Settings
+
+
+class Localization(StrEnum):
+    """How samples are grouped for local models.
+
+    SEGMENTS   by segment class and aligned step (T6-GPS, Sec. III-A and III-B)
+    TIME       by start, direction and time step, in world axes (standard GPS, Algorithm 1); needs task.directions
+    KIND, NONE, CLUSTERS   without segments: by kind and exit, not at all, by k-means (`localization`)
+    """
+
+    SEGMENTS = "segments"
+    TIME = "time"
+    KIND = "kind"
+    NONE = "none"
+    CLUSTERS = "clusters"
+
+
+class ModeSearch(StrEnum):
+    """How the modes of a class step are found: RANSAC (Sec. III-E), or a Gaussian mixture of as many components."""
+
+    RANSAC = "ransac"
+    GAUSSIAN = "gaussian"
+
 
 ReducedState = Literal["com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables"]
 LayerWidth = Annotated[int, Field(ge=1, le=4096)]
@@ -14,9 +38,11 @@ class LearnerSettings(Settings):
     """How trajectories become local models (III-A to III-E), improved actions (III-F) and a policy (II-A)."""
 
     reduced_state: ReducedState = Field("nodes", description="what the surrogate models predict (Sec. IV-C)")
+    localization: Localization = Field(Localization.SEGMENTS, description="how samples are grouped for local models")
     longest_segment_steps: int = Field(20, ge=2, le=1000, description="longer stays on a triangle are cut (steps)")
     smallest_class_segments: int = Field(40, ge=1, description="rarer classes share models (segments)")
     modes: int = Field(4, ge=1, le=16, description="most modes per class and time step")
+    mode_search: ModeSearch = Field(ModeSearch.RANSAC, description="how modes are found")
     residual_threshold: float = Field(0.35, gt=0.0, le=10.0, description="outliers lie beyond (standard deviations)")
     prior_samples: float = Field(500.0, ge=0.0, le=1e6, description="weight of the pooled model, n0 (samples)")
     ridge: float = Field(1e-3, gt=0.0, le=1.0, description="ridge relative to the variance of a regressor")

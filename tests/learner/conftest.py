@@ -152,6 +152,7 @@ def make_learner() -> Callable[..., Learner]:
             command_range_m=(0.65, 1.35),
             offset_m=OFFSET_M,
             scale_m=SCALE_M,
+            world_labels=np.tile(np.arange(24), (24, 1)),
             fit_map=fit_map,
         )
 
