@@ -28,10 +28,10 @@ def measure(name: str) -> dict[str, Any]:
         raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
     module = importlib.import_module(BENCHMARKS[name])
     run: Callable[[], dict[str, float]] = getattr(module, name)
-    return {"bench": name, "commit": _commit(), "threads": getattr(module, "THREADS", 1), "results": run()}
+    return {"bench": name, "commit": commit(), "threads": getattr(module, "THREADS", 1), "results": run()}
 
 
-def _commit() -> str:
+def commit() -> str:
     """The checked-out commit, or the version of an installed package."""
     folder = Path(__file__).parent
     git = subprocess.run(

@@ -8,31 +8,27 @@ from __future__ import annotations
 
 import json
 import shlex
-import signal
 import sys
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any
+from typing import Annotated, Any
 
 import pyarrow.compute as pc
 import typer
 
 from t6gps.service import bench as benchmarks
 from t6gps.service import config as configuration
-from t6gps.service import display, evaluation, operate, run
-from t6gps.service.config import Config
+from t6gps.service import display, evaluation, launch, operate, studies
 from t6gps.service.diagnosis import diagnose
 from t6gps.service.display import console
-from t6gps.service.executor import Executor
+from t6gps.service.launch import Engine
 from t6gps.service.operate import DEFAULT_ROOT, Json, Root, RunName
-from t6gps.storage import catalog, checkpoint, tables
+from t6gps.service.studies import Scale
+from t6gps.storage import catalog, tables
 from t6gps.storage import query as sql_query
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError, T6GpsError
-
-if TYPE_CHECKING:
-    from t6gps.workers.physics import Simulation
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -48,13 +44,6 @@ Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers 
 Autoscale = Annotated[
     str | None, typer.Option("--autoscale", metavar="MIN:MAX", help="Keep workers between, by backlog and free CPUs.")
 ]
-
-
-class Engine(StrEnum):
-    """Simulators of the robot."""
-
-    BULLET = "bullet"
-    MUJOCO = "mujoco"
 
 
 class ExportFormat(StrEnum):
@@ -100,35 +89,62 @@ def train(
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
-    from t6gps.service import figures
-
     config = configuration.load(source, _with_workers(overrides, workers, autoscale))
     name = Path(source).stem if run_name is None else run_name
     if resume:
         this = catalog.open_run(root, name)
-        _check_unchanged(this, config)
+        launch.check_unchanged(this, config, "repeat the run's settings, or start a new run with --run")
     else:
         this = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
-    with catalog.locked(this):
-        try:
-            with closing(_executor(config, serial, this)) as executor:
-                with display.ProgressDisplay(config.run.iterations) as progress:
-                    run.train(config, this, executor, progress)
-                result = _evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
-                executor.finished = True
-        except KeyboardInterrupt:
-            console.print(
-                f"stopped; everything sampled so far is kept. Go on with: {_again(this, source, root, overrides)}",
-                highlight=False,
-                soft_wrap=True,
-            )
-            raise typer.Exit(EXIT_INTERRUPTED) from None
-        evaluation.keep(this, result)
-        pictures = figures.draw(this, config.terrain)
+    try:
+        result, pictures = launch.complete(config, this, serial)
+    except KeyboardInterrupt:
+        console.print(
+            f"stopped; everything sampled so far is kept. Go on with: {_again(this, source, root, overrides)}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
     _print_learning(this)
     display.print_evaluation(result)
     operate.say_what_is_left_out(this)
     _print_paths(this, pictures, root)
+
+
+@app.command()
+def study(
+    name: Annotated[str, typer.Argument(metavar="NAME", help=f"One of: {', '.join(studies.STUDIES)}.")],
+    scale: Annotated[Scale, typer.Option(help="quick: half an hour on two cores; paper: the paper's sizes.")] = (
+        Scale.QUICK
+    ),
+    seeds: Annotated[int | None, typer.Option(min=1, help="Training seeds of each arm, from 0 on.")] = None,
+    arms: Annotated[str, typer.Option(metavar="PATTERN", help="Only arms of such names, e.g. '*-fast'.")] = "*",
+    root: Root = DEFAULT_ROOT,
+    out: Annotated[Path | None, typer.Option(help="Folder of the result; by default studies/NAME-SCALE.")] = None,
+    workers: Workers = None,
+    serial: Serial = False,
+    overrides: Overrides = None,
+) -> None:
+    """Compare settings over seeds; run it again to go on after an interruption."""
+    from t6gps.service import study as conducting
+
+    declared = studies.find(name)
+    planned = conducting.trials(name, declared, scale, seeds, _with_workers(overrides, workers), arms)
+    command = _study_command(name, scale, seeds, arms, root, out, overrides)
+    try:
+        finished = conducting.conduct(planned, root, name, declared.conditions, serial)
+    except KeyboardInterrupt:
+        console.print(
+            f"stopped; everything sampled so far is kept. Go on with: {shlex.join(command)}",
+            highlight=False,
+            soft_wrap=True,
+        )
+        raise typer.Exit(EXIT_INTERRUPTED) from None
+    from t6gps.service import study_report
+
+    files = study_report.write(out or Path("studies") / f"{name}-{scale}", name, declared, command, finished)
+    display.print_rows(f"Study {name}, {scale}", study_report.arm_rows(finished), display.ARM_COLUMNS)
+    typer.echo("\n".join(str(file) for file in files))
 
 
 @app.command(name="eval")
@@ -148,12 +164,8 @@ def evaluate(
     this = catalog.open_run(root, run_name)
     _check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
     config = configuration.parse(this.config_path.read_text(), _with_workers(overrides, workers))
-    latest = checkpoint.load_latest(this.checkpoints)
-    if latest is None:
-        raise RunError(f"run {run_name} has no checkpoint yet; let it finish an iteration")
-    with closing(_executor(config, serial, engine=engine)) as executor:
-        executor.ask("restore", *latest[1:])
-        result = _evaluated(config, executor, episodes, seed, terrain_seed)
+    with closing(launch.restored(config, this, serial, engine)) as executor:
+        result = launch.evaluated(config, executor, episodes, seed, terrain_seed)
     if as_json:
         typer.echo(json.dumps(result))
     else:
@@ -278,31 +290,6 @@ def bench(
 operate.add_to(app)
 
 
-def _executor(config: Config, serial: bool, this: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
-    executor: Executor
-    if serial or engine is Engine.MUJOCO:
-        from t6gps.service.serial import SerialExecutor
-
-        executor = SerialExecutor(config, this, _simulation(engine))
-    else:
-        from t6gps.service.actors import RayExecutor
-
-        executor = RayExecutor(config, this)
-    # After the executor is made, since Ray sets a handler of its own.
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
-    return executor
-
-
-def _simulation(engine: Engine) -> type[Simulation]:
-    if engine is Engine.MUJOCO:
-        from t6gps.workers.mujoco_engine import MujocoSimulation
-
-        return MujocoSimulation
-    from t6gps.workers.physics import Simulation
-
-    return Simulation
-
-
 def _check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, ...], reason: str) -> None:
     for override in overrides or []:
         if not override.startswith(allowed):
@@ -332,26 +319,20 @@ def _free_name(root: Path, name: str) -> str:
     return free
 
 
-def _check_unchanged(this: Run, config: Config) -> None:
-    stored = configuration.parse(this.config_path.read_text())
-    changed = configuration.differences(stored, config)
-    if changed:
-        raise RunError(
-            f"--resume must keep the configuration of run {this.name}, found {'; '.join(changed)}; "
-            "repeat the run's settings, or start a new run with --run"
-        )
-
-
 def _again(this: Run, source: str, root: Path, overrides: list[str] | None) -> str:
     parts = ["t6gps", "train", source, "--run", this.name, "--root", str(root), "--resume"]
     return shlex.join(parts + [f"--set={override}" for override in overrides or []])
 
 
-def _evaluated(
-    config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None
-) -> evaluation.Evaluation:
-    with display.ProgressDisplay(config.run.iterations) as progress:
-        return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, progress)
+def _study_command(
+    name: str, scale: Scale, seeds: int | None, arms: str, root: Path, out: Path | None, overrides: list[str] | None
+) -> list[str]:
+    parts = ["t6gps", "study", name, "--scale", scale.value]
+    parts += [] if seeds is None else ["--seeds", str(seeds)]
+    parts += [] if arms == "*" else ["--arms", arms]
+    parts += [] if root == DEFAULT_ROOT else ["--root", str(root)]
+    parts += [] if out is None else ["--out", str(out)]
+    return parts + [f"--set={override}" for override in overrides or []]
 
 
 def _print_learning(this: Run) -> None:

@@ -12,7 +12,7 @@ from typing import Any
 
 from pydantic import BaseModel, Field, ValidationError, model_validator
 
-from t6gps.learner.settings import LearnerSettings
+from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
@@ -92,7 +92,23 @@ def load(source: str, overrides: Sequence[str] = ()) -> Config:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source} is not TOML: {error}; correct the file") from None
-    return _checked_world(_validated(_overridden(values, overrides), source))
+    return _checked_learner(_checked_world(_validated(_overridden(values, overrides), source)), source)
+
+
+def _checked_learner(config: Config, where: str) -> Config:
+    """The configuration, its learner seen to fit the episodes it will get; ConfigError otherwise."""
+    horizon, steps = config.learner.horizon_steps, config.run.steps
+    if horizon > steps:
+        raise ConfigError(
+            f"{where}: learner.horizon_steps = {horizon} is longer than an episode of run.steps = {steps}; "
+            "allowed: at most as long; lower the first or raise the second"
+        )
+    if config.learner.localization is Localization.TIME and not config.task.directions:
+        raise ConfigError(
+            f"{where}: learner.localization = time needs a common start, found task.directions = 0; "
+            "set task.directions to the number of directions, 36 for example"
+        )
+    return config
 
 
 def _checked_world(config: Config) -> Config:
@@ -171,7 +187,7 @@ def _sentence(item: dict[str, Any]) -> str:
         return f"unknown key {key}{_nearest(key, _known_keys())}; allowed: {', '.join(_siblings(key))}"
     found = "" if isinstance(item["input"], dict) else f", found {item['input']!r}"
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    return f"{key} {message}{found}"
+    return f"{key} {message}{found}".strip()
 
 
 def _siblings(key: str) -> list[str]:

@@ -61,6 +61,20 @@ CLASS_COLUMNS = {
     "policy_kl": ("KL nat", "{:.2f}"),
 }
 
+ARM_COLUMNS = {
+    "arm": ("arm", "{}"),
+    "seeds": ("seeds", "{:d}"),
+    "steps": ("steps", "{:,}"),
+    "forward_speed_m_per_s": ("forward m/s", "{:.3f}"),
+    "forward_speed_m_per_s_deviation": ("+-", "{:.3f}"),
+    "stuck_share": ("stuck by speed", "{:.1%}"),
+    "stuck_share_by_distance": ("by distance", "{:.1%}"),
+    "waypoints_per_episode": ("waypoints", "{:.2f}"),
+    "cost": ("cost", "{:.3f}"),
+    "cost_deviation": ("+-", "{:.3f}"),
+    "wall_s": ("wall s", "{:.0f}"),
+}
+
 
 class ProgressDisplay:
     """Shows a bar per phase of the current iteration and one line per finished iteration."""
@@ -129,7 +143,7 @@ def print_evaluation(result: Evaluation) -> None:
     """Print what `evaluate` measured."""
     title = f"Noise-free policy, {result['episodes']} unseen episodes (seed {result['seed']})"
     columns = {"key": ("quantity", "{}"), "mean": ("mean", "{:.4f}"), "standard_error": ("standard error", "{:.4f}")}
-    print_rows(title, [{"key": key, **result[key]} for key in EVALUATED], columns)
+    print_rows(title, [{"key": key, **result[key]} for key in EVALUATED if key in result], columns)
 
 
 def write_table(table: pa.Table, form: str) -> None:

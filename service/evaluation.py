@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import pyarrow as pa
@@ -17,13 +19,14 @@ from t6gps.storage.catalog import Run
 EVALUATED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
     "stuck_share": "stuck_share",
+    "stuck_share_by_distance": "stuck_share_by_distance",
     "waypoints_per_episode": "waypoints_reached",
     "cost": "cost",
 }
 """Reported quantities and the columns of `episodes` they summarise."""
 
 Evaluation = dict[str, Any]
-"""`episodes`, `seed`, and of each of EVALUATED its mean and standard error over episodes."""
+"""`episodes`, `seed`, and of each of EVALUATED its mean and standard error over the episodes that have it (or None)."""
 
 
 def evaluate(
@@ -36,22 +39,33 @@ def evaluate(
     for episode in executor.sample(plans, snapshot, "evaluation"):
         summaries[episode.summary["index"][0].as_py()] = episode.summary
         observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
-    table = pa.concat_tables([summaries[index] for index in sorted(summaries)])
+    return summarise([summaries[index] for index in sorted(summaries)], seed)
+
+
+def summarise(summaries: Sequence[pa.Table], seed: int) -> Evaluation:
+    """The evaluation that episodes (rows of `episodes`) make up."""
+    table = pa.concat_tables(summaries)
     result: Evaluation = {"episodes": len(summaries), "seed": seed}
     for key, column in EVALUATED.items():
-        mean, error = mean_and_error(table[column].to_numpy().astype(float))
+        values = table[column].drop_null().to_numpy().astype(float)
+        mean, error = mean_and_error(values) if len(values) else (None, None)
         result[key] = {"mean": mean, "standard_error": error}
     return result
 
 
-def keep(run: Run, evaluation: Evaluation) -> None:
-    """Keep the evaluation that ended the training beside the run's tables."""
-    path = run.path / "evaluation.json"
+def keep(run: Run, evaluation: Evaluation, condition: str | None = None) -> None:
+    """Keep the evaluation that ended the training, or one under another condition, beside the run's tables."""
+    path = _path(run, condition)
+    path.parent.mkdir(exist_ok=True)
     durable.hidden(path).write_text(json.dumps(evaluation, indent=2) + "\n")
     durable.publish(path)
 
 
-def kept(run: Run) -> Evaluation | None:
-    """The evaluation that ended the training, None before its end."""
-    path = run.path / "evaluation.json"
+def kept(run: Run, condition: str | None = None) -> Evaluation | None:
+    """The evaluation that ended the training, or one under another condition; None before it is kept."""
+    path = _path(run, condition)
     return json.loads(path.read_text()) if path.exists() else None
+
+
+def _path(run: Run, condition: str | None) -> Path:
+    return run.path / "evaluation.json" if condition is None else run.path / "conditions" / f"{condition}.json"

@@ -81,10 +81,10 @@ def draw(run: Run, terrain: TerrainSettings) -> list[Path]:
         "ground_track": ground_track(frames, episodes, terrain),
         "segments": segments(frames, classes),
     }
-    return [_save(figure, run.figures / f"{name}.png") for name, figure in figures.items()]
+    return [save(figure, run.figures / f"{name}.png") for name, figure in figures.items()]
 
 
-def _save(figure: Figure, path: Path) -> Path:
+def save(figure: Figure, path: Path) -> Path:
     path.parent.mkdir(exist_ok=True)
     with rc_context(STYLE):
         figure.savefig(durable.hidden(path), format="png")
@@ -92,29 +92,29 @@ def _save(figure: Figure, path: Path) -> Path:
     return path
 
 
-def _figure(width: float, height: float) -> Figure:
+def canvas(width: float, height: float) -> Figure:
     return Figure(figsize=(width, height), dpi=STYLE["savefig.dpi"], layout="constrained")
 
 
-def _numbers(table: pa.Table, name: str) -> Array:
+def numbers(table: pa.Table, name: str) -> Array:
     return np.asarray(schema.array(table, name), dtype=np.float64)
 
 
 def learning(iterations: pa.Table) -> Figure:
     """Cost, forward speed and stuck share of each iteration, with standard errors over its episodes."""
     with rc_context(STYLE):
-        figure = _figure(10, 3.2)
+        figure = canvas(10, 3.2)
         panels = (
             ("Cost", "mean running cost (m²/s²)", "cost", "cost_standard_error", BLUE),
             ("Forward speed", "towards the waypoint (m/s)", SPEED, "forward_speed_standard_error", GREEN),
             ("Stuck", "share of time below 0.05 m/s (%)", "stuck_share", None, RED),
         )
         for axes, (title, label, mean, error, colour) in zip(figure.subplots(1, 3), panels, strict=True):
-            x, y = _numbers(iterations, "iteration"), _numbers(iterations, mean)
+            x, y = numbers(iterations, "iteration"), numbers(iterations, mean)
             if error is None:
                 y = 100 * y
             else:
-                spread = _numbers(iterations, error)
+                spread = numbers(iterations, error)
                 axes.fill_between(x, y - spread, y + spread, color=colour, alpha=0.2, linewidth=0)
             axes.plot(x, y, color=colour, marker="o", markersize=4.5)
             axes.set(title=title, xlabel="iteration", ylabel=label)
@@ -128,7 +128,7 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: TerrainSettings
 
     Darker ground is lower, circles have the size of the robot (paper Sec. V, the figure of the ground track).
     """
-    order = np.argsort(_numbers(episodes, SPEED), kind="stable")
+    order = np.argsort(numbers(episodes, SPEED), kind="stable")
     rows = episodes.to_pylist()
     typical = rows[int(order[(len(order) - 1) // 2])]
     alike = [row["episode_id"] for row in rows if _ground(row) == _ground(typical) and row is not typical]
@@ -136,11 +136,11 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: TerrainSettings
     corners = np.concatenate([path, path[:1] - 1.5, path[:1] + 1.5, goals - 1.5, goals + 1.5])
     low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
     with rc_context(STYLE):
-        figure = _figure(7, 6.2)
+        figure = canvas(7, 6.2)
         axes = figure.subplots()
         terrain = ground(settings, typical["terrain_seed"], typical["terrain_difficulty"])
         if terrain is not None:
-            _contours(figure, axes, terrain, low, high)
+            contours(figure, axes, terrain, low, high)
         for other in alike[:OTHER_TRACKS_N]:
             axes.plot(*_track(frames, other)[0].T, color=GREY, alpha=0.5, linewidth=0.9, zorder=2, label="others")
         axes.add_patch(Circle(tuple(path[0]), WAYPOINT_RADIUS_M, facecolor=GREY, alpha=0.6, zorder=3))
@@ -171,13 +171,13 @@ def _ground(episode: dict[str, Any]) -> tuple[int, float] | None:
 def _track(frames: pa.Table, episode_id: int) -> tuple[Array, Array]:
     """Path [T + 1, 2] and waypoints in their order [n, 2] (m) of one episode."""
     rows = frames.select(TRACK_COLUMNS).filter(pc.field("episode_id") == episode_id).sort_by("step")
-    path = np.column_stack([_numbers(rows, "com_x_m"), _numbers(rows, "com_y_m")])
-    goals = np.column_stack([_numbers(rows, "waypoint_x_m"), _numbers(rows, "waypoint_y_m")])
+    path = np.column_stack([numbers(rows, "com_x_m"), numbers(rows, "com_y_m")])
+    goals = np.column_stack([numbers(rows, "waypoint_x_m"), numbers(rows, "waypoint_y_m")])
     _, first = np.unique(goals, axis=0, return_index=True)
     return path, goals[np.sort(first)]
 
 
-def _contours(figure: Figure, axes: Axes, terrain: Terrain, low: Array, high: Array) -> None:
+def contours(figure: Figure, axes: Axes, terrain: Terrain, low: Array, high: Array) -> None:
     x, y = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[1], high[1], 200))
     heights = terrain.height(x, y)
     levels = np.linspace(heights.min(), heights.max(), 9)
@@ -192,7 +192,7 @@ def segments(frames: pa.Table, classes: pa.Table) -> Figure:
     """Paths of the CoM over its support triangle in the canonical frame, by class (paper Fig. 4b), and class sizes."""
     kind, keys, paths = _paths(frames)
     with rc_context(STYLE):
-        figure = _figure(11, 3.9)
+        figure = canvas(11, 3.9)
         *maps, bars = figure.subplots(1, 3, width_ratios=[1, 1, 1.15])
         for axes, number in zip(maps, (DELTA, LAMBDA), strict=True):
             _triangle(axes, number)
@@ -204,12 +204,12 @@ def segments(frames: pa.Table, classes: pa.Table) -> Figure:
 def _paths(frames: pa.Table) -> tuple[list[int], list[ClassName], list[Array]]:
     """Kind, class and path [t, 2] (m) about the centre of its support triangle of each stay on one triangle."""
     rows = frames.select(SEGMENT_COLUMNS).sort_by([("episode_id", "ascending"), ("step", "ascending")])
-    kind = _numbers(rows, "kind").astype(int)
-    nodes = _numbers(rows, "nodes").reshape(-1, 12, 3)
+    kind = numbers(rows, "kind").astype(int)
+    nodes = numbers(rows, "nodes").reshape(-1, 12, 3)
     corners = FACES[REFERENCE_FACE][kind]
     com = -np.take_along_axis(nodes[..., :2], corners[..., None], axis=1).mean(axis=1)
-    changes = np.diff(_numbers(rows, "face")) != 0
-    starts = np.flatnonzero(np.concatenate([[True], changes | (np.diff(_numbers(rows, "episode_id")) != 0)]))
+    changes = np.diff(numbers(rows, "face")) != 0
+    starts = np.flatnonzero(np.concatenate([[True], changes | (np.diff(numbers(rows, "episode_id")) != 0)]))
     stops = np.append(starts[1:], rows.num_rows)
     entry, exit_ = rows["entry_edge"].to_pylist(), rows["exit_edge"].to_pylist()
     keys = [(int(kind[a]), entry[a], exit_[b - 1]) for a, b in zip(starts, stops, strict=True)]

@@ -55,7 +55,7 @@ def test_a_finished_run_has_data_checkpoints_and_figures(root: Path) -> None:
 
 def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
     result = json.loads(t6gps("eval", "tiny", "--episodes", "2", "--serial", "--json", root=root).stdout)
-    for key in ("forward_speed_m_per_s", "stuck_share", "waypoints_per_episode", "cost"):
+    for key in ("forward_speed_m_per_s", "stuck_share", "stuck_share_by_distance", "waypoints_per_episode", "cost"):
         assert set(result[key]) == {"mean", "standard_error"}
 
 
@@ -126,6 +126,9 @@ def test_resuming_a_finished_run_keeps_it(root: Path) -> None:
         (["query", "tiny", "COPY episodes TO 'x.csv'"], ["SELECT"]),
         (["render", "tiny", "99", "--out", "x.png"], ["99", "5"]),
         (["render", "tiny", "0", "--out", "x.gif"], [".png", ".mp4"]),
+        (["study", "horizont"], ["unknown study 'horizont'", "did you mean horizon"]),
+        (["study", "horizon", "--set=run.steps=15", "--set=run.episodes=60"],
+         ["learner.horizon_steps = 20", "longer than an episode"]),
         (["bench", "phisics"], ["unknown benchmark 'phisics'", "physics"]),
     ],
 )  # fmt: skip

@@ -10,7 +10,16 @@ from t6gps.storage.errors import ConfigError
 
 
 def test_the_presets_of_the_paper_have_its_sizes() -> None:
-    assert presets() == ["flat", "flat-hardware", "flat-quick", "flat-soft", "flat-stiff", "rough", "rough-quick"]
+    assert presets() == [
+        "flat",
+        "flat-fast",
+        "flat-hardware",
+        "flat-quick",
+        "flat-soft",
+        "flat-stiff",
+        "rough",
+        "rough-quick",
+    ]
     rough, flat = load("rough"), load("flat")
     assert (rough.run.episodes, rough.run.steps, rough.run.iterations) == (300, 250, 5)
     assert rough.terrain.difficulty == 1.0
