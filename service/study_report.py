@@ -39,10 +39,9 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
     """Write the study's folder and return its files, the page first."""
     out.mkdir(parents=True, exist_ok=True)
     arms = arm_rows(finished)
-    pictures = [
-        figures.save(FIGURES[figure](finished), out / f"{figure}.png")
-        for figure in ("evaluations", "learning", *study.figures)
-    ]
+    learners = any(one.trial.declared.peer is None for one in finished)
+    drawn = ("evaluations", *(["learning"] if learners else []), *study.figures)
+    pictures = [figures.save(FIGURES[figure](finished), out / f"{figure}.png") for figure in drawn]
     written = {
         "README.md": _page(name, study, command, finished, arms, pictures),
         "table.md": markdown(arms),
@@ -50,7 +49,9 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
     for file, text in written.items():
         durable.hidden(out / file).write_text(text, encoding="utf-8")
         durable.publish(out / file)
-    sheets = {"table.csv": arms, "runs.csv": run_rows(finished), "iterations.csv": iteration_rows(finished)}
+    sheets = {"table.csv": arms, "runs.csv": run_rows(finished)}
+    if learners:
+        sheets["iterations.csv"] = iteration_rows(finished)
     if study.conditions:
         sheets["conditions.csv"] = condition_rows(finished)
     for file, rows in sheets.items():

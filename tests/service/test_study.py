@@ -194,6 +194,7 @@ def test_a_peer_is_evaluated_on_the_episodes_of_its_run_and_kept(
         arms={"peer": Arm("peer", "flat", "flat-quick", peer=peer)},
         quick=("run.iterations=1", "run.episodes=5", "run.steps=250", "run.evaluation_episodes=2"),
         quick_seeds=1,
+        figures=("conditions",),
         conditions={"one-way": ("task.directions=1", "run.steps=20")},
     )
     planned = study.trials("peers", one, Scale.QUICK)
@@ -204,6 +205,9 @@ def test_a_peer_is_evaluated_on_the_episodes_of_its_run_and_kept(
     assert first[0].evaluation["forward_speed_m_per_s"]["standard_error"] > 0
     assert first[0].conditions["one-way"]["forward_speed_m_per_s"]["standard_error"] == 0
     assert study_report.arm_rows(first)[0]["steps"] == (0 if peer is Peer.FLOP else 1250)
+    files = study_report.write(tmp_path / "out", "peers", one, ["t6gps", "study", "peers"], first)
+    assert {file.stem for file in files if file.suffix == ".png"} == {"evaluations", "conditions"}
+    assert "| peer | one-way |" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_the_workers_command_what_ppo_commands_on_average() -> None:
