@@ -10,7 +10,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test check bench clean
+.PHONY: install train test check bench soak clean
 
 install: $(STAMP)
 
@@ -35,6 +35,10 @@ check: install
 
 bench: install
 	$(BIN)/t6gps bench physics
+
+# Half an hour of workers killed, stopped and scaled at random; the figures are printed at the end.
+soak: install
+	T6GPS_SOAK_MINUTES=30 $(BIN)/pytest -s tests/faults/test_soak.py
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache
