@@ -312,14 +312,14 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
 
     episodes = house.sample()
     next(episodes)
-    wait_until(told(lambda found: found["leases"] + found["arrived"] == 4), 10)  # the episode that is not kept yet, too
+    wait_until(told(lambda found: found["leases"] + found["arrived"] == 4), 90)  # the episode that is not kept yet, too
     found = control.status(house.run)
     assert (found["state"], found["ready"], found["wanted"], found["backlog"]) == ("RUNNING", 2, 2, 30)
     assert {(worker["slot"], worker["pid"]) for worker in found["workers"]} == {(w.slot, pid(w)) for w in house.workers}
     assert found["bytes_in_flight"] > 0
     list(episodes)
     waits = "2 workers wait for plans"
-    wait_until(told(lambda found: waits in [wait["what"] for wait in found["waits"]]), 10)
+    wait_until(told(lambda found: waits in [wait["what"] for wait in found["waits"]]), 90)
 
 
 def test_the_configuration_of_these_tests_is_one_a_run_could_keep() -> None:
