@@ -98,7 +98,8 @@ def scale(run: Run, workers: int, deadline_s: float = SCALE_DEADLINE_S) -> dict[
     """
     before = status(run)
     if before["state"] in ("STOPPED", "STOPPING", *ENDED):
-        raise RunError(f"run {run.name} is not running ({before['state']}: {before['reason']}); start it with --resume")
+        reason = f": {before['reason']}" if before["reason"] else ""
+        raise RunError(f"run {run.name} is not running ({before['state']}{reason}); go on with t6gps train --resume")
     if not 0 <= workers <= before["most"]:
         raise RunError(f"workers must lie in 0 .. {before['most']} for run {run.name}, found {workers}")
     path, wish = run.pool / "wish.json", uuid.uuid4().hex
