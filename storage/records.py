@@ -9,7 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, eq=False)
 class PolicySnapshot:
     """The noise-free policy u = offset + scale * network(observation), ready to act with.
 

@@ -17,3 +17,15 @@ def observe(
     out: NDArray[float32],
     /,
 ) -> float: ...
+def extremes(
+    positions: NDArray[float64], orientations: NDArray[float64], heights: NDArray[float64], cell_m: float, /
+) -> tuple[float, float]: ...
+def steer(
+    mean: NDArray[float64],
+    departure: NDArray[float64],
+    element: int,
+    shortest_m: float,
+    longest_m: float,
+    out: NDArray[float64],
+    /,
+) -> None: ...

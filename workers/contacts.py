@@ -1,4 +1,4 @@
-"""The binding of workers/native/contacts.c, which spares Bullet the triangles that a bar cannot touch."""
+"""The binding of workers/native/contacts.c, which finds the contacts of bars and triangles in place of Bullet."""
 
 from __future__ import annotations
 
@@ -22,16 +22,16 @@ _SYMBOL_TABLE = 2
 
 
 def library_path() -> Path | None:
-    """The compiled test beside this file, None if it was not built."""
+    """The compiled functions beside this file, None if they were not built."""
     candidates = [Path(__file__).with_name(f"_contacts{suffix}") for suffix in EXTENSION_SUFFIXES]
     return next((candidate for candidate in candidates if candidate.exists()), None)
 
 
 @cache
-def cull_triangles() -> bool:
-    """Put the test before Bullet's own, for every client of this process. What Bullet computes stays the same.
+def take_over() -> bool:
+    """Put the compiled functions in the place of Bullet's, for every client of this process.
 
-    False where it cannot be done: the test was not built, or this build of pybullet is not the one it was made for.
+    False where it cannot be done: they were not built, or this build of pybullet is not the one they were made for.
     """
     path = library_path()
     values = _symbols(Path(pybullet.__file__), [_EXPORTED, _TABLE, _FUNCTION])
@@ -39,7 +39,7 @@ def cull_triangles() -> bool:
         return False
     exported = ctypes.cast(getattr(ctypes.CDLL(pybullet.__file__), _EXPORTED), ctypes.c_void_p).value
     base = (exported or 0) - values[_EXPORTED]
-    install = ctypes.CDLL(str(path)).cull_triangles
+    install = ctypes.CDLL(str(path)).take_over
     install.argtypes = [ctypes.c_size_t, ctypes.c_size_t]
     return bool(install(base + values[_TABLE], base + values[_FUNCTION]))
 

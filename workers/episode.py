@@ -28,8 +28,8 @@ class RunningEpisode:
 
     Observed rest lengths are centred on `nominal_m`, the policy's own, whatever robot it meets. Commands act
     `delay_steps` control steps after they are given; until then the winches hold. `number` chooses among the
-    directions of the task if it has any. Raises PhysicsError if the robot
-    cannot even start, TerrainError if there is no such ground.
+    directions of the task if it has any. Raises PhysicsError if the robot cannot even start, TerrainError if there is
+    no such ground.
     """
 
     def __init__(
@@ -73,7 +73,7 @@ class RunningEpisode:
     def _look(self, previous: SupportFrame | None) -> None:
         face, x, y, _ = survey(self.state)
         if previous is None or face != previous.face:
-            self.frame = enter(face, previous, self.state.nodes(), self.state.com)
+            self.frame = enter(face, previous, self.state)
         self.waypoint = self.course.advance(x, y, self._step * CONTROL_STEP_S)
         way_x, way_y = self.waypoint[0] - x, self.waypoint[1] - y
         distance = hypot(way_x, way_y)

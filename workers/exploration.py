@@ -8,12 +8,14 @@ from numpy.typing import NDArray
 from t6gps.workers.topology import CABLES_N
 
 
-def noise(rng: np.random.Generator, std_m: float, correlation: float) -> Iterator[NDArray[np.float64]]:
+def noise(rng: np.random.Generator, std_m: float, correlation: float, steps: int) -> Iterator[NDArray[np.float64]]:
     """Stationary first-order noise, independent per cable: e' = rho e + sqrt(1 - rho^2) std n.
 
     Yields one sample [24] (m) per control step, in world labels, so that it does not jump when the frame changes.
     """
-    sample = std_m * rng.standard_normal(CABLES_N)
-    while True:
+    innovations = std_m * rng.standard_normal((steps, CABLES_N))
+    innovations[1:] *= np.sqrt(1 - correlation**2)
+    sample = np.zeros(CABLES_N)
+    for innovation in innovations:
+        sample = correlation * sample + innovation
         yield sample
-        sample = correlation * sample + np.sqrt(1 - correlation**2) * std_m * rng.standard_normal(CABLES_N)

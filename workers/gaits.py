@@ -6,7 +6,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t6gps.workers.episode import RunningEpisode
-from t6gps.workers.rollout import Controller, canonical_action
+from t6gps.workers.rollout import Controller
+from t6gps.workers.symmetry import CABLES_FROM
 from t6gps.workers.topology import CABLES, CABLES_N
 
 Array = NDArray[np.float64]
@@ -32,7 +33,7 @@ def flop(nominal_m: float) -> Controller:
         nodes = episode.state.nodes() - episode.state.com
         middle = nodes[CABLES].mean(axis=1)
         ahead = middle[:, :2] @ np.array(episode.target)
-        return canonical_action(nominal_m - (LEAN + LEAN_WITH_HEIGHT * middle[:, 2]) * ahead, episode.frame)
+        return _canonical(nominal_m - (LEAN + LEAN_WITH_HEIGHT * middle[:, 2]) * ahead, episode)
 
     return control
 
@@ -48,6 +49,11 @@ def waves(nominal_m: float, parameters: Array) -> Controller:
 
     def control(episode: RunningEpisode, step: int) -> Array:
         phase = 2 * np.pi * frequency_hz * step / 10
-        return canonical_action(nominal_m + cosine * np.cos(phase) + sine * np.sin(phase), episode.frame)
+        return _canonical(nominal_m + cosine * np.cos(phase) + sine * np.sin(phase), episode)
 
     return control
+
+
+def _canonical(command: NDArray[np.float64], episode: RunningEpisode) -> NDArray[np.float64]:
+    """Commands [24] of the cables in world labels, relabelled for the present frame."""
+    return command[CABLES_FROM[episode.frame.element]]

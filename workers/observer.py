@@ -1,7 +1,7 @@
 """The binding of workers/native/observer.c: what a worker computes between two control steps, at compiled speed.
 
-`support.support_face`, `symmetry.frame_yaw` and `observation.observe` define the same in Python; a contract test holds
-both equal.
+`support.support_face`, `symmetry.frame_yaw`, `observation.observe` and `Terrain.height` define the same in Python; a
+contract test holds both equal.
 """
 
 from __future__ import annotations
@@ -22,7 +22,8 @@ from t6gps.workers.symmetry import (
     REFERENCE_FACE,
     REFERENCE_TRIANGLES_M,
 )
-from t6gps.workers.topology import BAR_LENGTH_M, FACE_KINDS, FACES
+from t6gps.workers.terrain import Terrain
+from t6gps.workers.topology import BAR_LENGTH_M, CABLES_N, FACE_KINDS, FACES
 
 _LABELS = (FACES, FACE_KINDS, REFERENCE_FACE, NODES_FROM, BARS_FROM, CABLES_FROM, PROPER)
 _SCALES = (BAR_LENGTH_M, REST_LENGTH_SCALE_M, ANGULAR_VELOCITY_SCALE_RAD_PER_S, SLOWEST_TRACK_M_PER_S)
@@ -36,6 +37,11 @@ _observer.bind(
 def survey(state: RobotState) -> tuple[int, float, float, float]:
     """Support face (as `support.support_face`) and centre of mass x, y, z (m) of a state."""
     return _observer.survey(state.bar_positions, state.bar_orientations)
+
+
+def extremes(state: RobotState, terrain: Terrain) -> tuple[float, float]:
+    """Largest |x| or |y| (m) of the nodes, and how deep the deepest lies below the ground (m; negative above it)."""
+    return _observer.extremes(state.bar_positions, state.bar_orientations, terrain.heights, terrain.cell_m)
 
 
 def observe(
@@ -56,3 +62,16 @@ def observe(
         observation,
     )
     return yaw, observation
+
+
+def steer(
+    mean: NDArray[np.float64], departure: NDArray[np.float64], element: int, shortest_m: float, longest_m: float
+) -> NDArray[np.float64]:
+    """What is commanded when a controller wants `mean` [24] (m), in canonical labels, and noise departs from it.
+
+    Returns three rows [3, 24] (m): the mean within the range of commands; the command in world labels, as `departure`
+    [24] is, within the range too; and that command in canonical labels.
+    """
+    rows = np.empty((3, CABLES_N))
+    _observer.steer(mean, departure, element, shortest_m, longest_m, rows)
+    return rows

@@ -15,7 +15,8 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.workers.bullet import pybullet
-from t6gps.workers.contacts import cull_triangles
+from t6gps.workers.contacts import take_over
+from t6gps.workers.observer import extremes
 from t6gps.workers.plugin import PluginStepper
 from t6gps.workers.reference import ReferenceStepper, read_state
 from t6gps.workers.settings import RobotSettings
@@ -46,25 +47,33 @@ def nominal_rest_length(robot: RobotSettings) -> float:
     return CABLE_LENGTH_M - robot.pretension_n / robot.cable_stiffness_n_per_m
 
 
+@cache
 def neutral_state(robot: RobotSettings, height_m: float = BAR_LENGTH_M / 2 + 0.1) -> RobotState:
     """The neutral shape at rest, as in topology.NODES_M, with its centre at height `height_m` over the origin."""
     first, second = NODES_M[BARS[:, 0]], NODES_M[BARS[:, 1]]
     axes = (first - second) / BAR_LENGTH_M
     # The shortest rotation from z to an axis n is the normalised quaternion (z x n, 1 + z . n); no axis is -z.
     orientations = np.stack([-axes[:, 1], axes[:, 0], np.zeros(BARS_N), 1 + axes[:, 2]], axis=1)
-    return RobotState(
+    state = RobotState(
         (first + second) / 2 + [0.0, 0.0, height_m],
         orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
         np.zeros((BARS_N, 3)),
         np.zeros((BARS_N, 3)),
         np.full(CABLES_N, nominal_rest_length(robot)),
     )
+    for values in vars(state).values():
+        values.setflags(write=False)  # every caller gets the same arrays
+    return state
 
 
 @cache
-def _mesh_lists(vertices_n: int, indices_n: int) -> tuple[list[list[float]], list[int]]:
-    """Lists to hand meshes over in. PyBullet 3.2.7 never lets go of such lists, so the same ones serve every mesh."""
-    return [[0.0, 0.0, 0.0] for _ in range(vertices_n)], [0] * indices_n
+def _mesh_lists(points_n: int, cell_m: float) -> tuple[list[list[float]], list[int]]:
+    """Lists to hand over the mesh of a square ground, all but its heights (vertices, vertex numbers of the triangles).
+
+    PyBullet 3.2.7 never lets go of such lists, so the same ones serve every ground of this size.
+    """
+    vertices, faces = Terrain(np.zeros((points_n, points_n)), cell_m).triangles()
+    return vertices.tolist(), faces.ravel().tolist()
 
 
 class Simulation:
@@ -88,7 +97,7 @@ class Simulation:
         self.robot = robot
         self.bodies: list[int] = []
         self._terrain: Terrain | None = None
-        cull_triangles()
+        take_over()
         self.client = pybullet.connect(pybullet.DIRECT)
         if self.client < 0:
             raise PhysicsError("PyBullet cannot open another client; close simulations that are no longer used")
@@ -139,13 +148,11 @@ class Simulation:
         if self._terrain is None:
             shape = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
         else:
-            vertices, faces = self._terrain.triangles()
-            rows, indices = _mesh_lists(len(vertices), faces.size)
-            for row, vertex in zip(rows, vertices.tolist(), strict=True):
-                row[:] = vertex
-            indices[:] = faces.ravel().tolist()
+            vertices, indices = _mesh_lists(len(self._terrain.heights), self._terrain.cell_m)
+            for vertex, height in zip(vertices, self._terrain.heights.ravel().tolist(), strict=True):
+                vertex[2] = height
             shape = pybullet.createCollisionShape(
-                pybullet.GEOM_MESH, vertices=rows, indices=indices, physicsClientId=client
+                pybullet.GEOM_MESH, vertices=vertices, indices=indices, physicsClientId=client
             )
         # A plain rigid body: as a multibody it would take part in every solver row, though it never moves.
         ground = pybullet.createMultiBody(0.0, shape, useMaximalCoordinates=1, physicsClientId=client)
@@ -225,15 +232,14 @@ class Simulation:
             )
         if self._terrain is None:
             return  # the plane is a half-space: nothing passes through it
-        nodes = state.nodes()
-        side, allowed = np.abs(nodes[:, :2]).max(), self._terrain.half_size_m
+        side, depth = extremes(state, self._terrain)
+        allowed = self._terrain.half_size_m
         if side > allowed:
             raise UnsoundStateError(
                 f"a node is {side:.2f} m from the centre, beyond the ground's side at {allowed} m; "
                 "use a larger ground or nearer waypoints",
                 reason="beyond the ground",
             )
-        depth = (self._terrain.height(nodes[:, 0], nodes[:, 1]) - nodes[:, 2]).max()
         if depth > _DEEPEST_SOUND_M:
             raise UnsoundStateError(
                 f"a node is {depth:.2f} m below the ground, more than {_DEEPEST_SOUND_M}: a bar passed through it; "

@@ -1,7 +1,9 @@
-"""The policy as the workers run it: a few matrix-vector products, without the library that trained it."""
+"""The policy as the workers run it: a few products of matrices and vectors, without the library that trained it."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import lru_cache
 from itertools import pairwise
 
 import numpy as np
@@ -9,20 +11,37 @@ from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import PolicySnapshot
+from t6gps.workers import _policy
+
+BLOCK = 32
+"""Outputs that are computed side by side (workers/native/policy.c)."""
 
 
-def act(policy: PolicySnapshot, observation: NDArray[np.float32]) -> NDArray[np.float32]:
-    """Canonical rest lengths [24] (m) that the policy commands without noise for an observation [47].
+@lru_cache(maxsize=2)
+def ready(policy: PolicySnapshot) -> Callable[[NDArray[np.float32]], NDArray[np.float64]]:
+    """The function from an observation [47] to the canonical rest lengths [24] (m) that the policy commands.
 
-    Three hidden layers of tanh units (paper Sec. IV-C); the same numbers as the learner's network to float32 rounding.
+    There is no noise in it. Three hidden layers of tanh units (paper Sec. IV-C); the same numbers as the learner's
+    network to float32 rounding.
     """
-    hidden = observation
-    for weight, bias in policy.layers[:-1]:
-        hidden = weight @ hidden
-        hidden += bias
-        np.tanh(hidden, out=hidden)
-    weight, bias = policy.layers[-1]
-    return policy.offset_m + policy.scale_m * (weight @ hidden + bias)
+    parameters = np.concatenate([_packed(weight, bias) for weight, bias in policy.layers])
+    widths = np.array([policy.layers[0][0].shape[1], *(len(bias) for _, bias in policy.layers)], dtype=np.int32)
+    commands_n = int(widths[-1])
+
+    def act(observation: NDArray[np.float32]) -> NDArray[np.float64]:
+        commands = np.empty(commands_n)
+        _policy.act(parameters, widths, observation, commands, policy.offset_m, policy.scale_m)
+        return commands
+
+    return act
+
+
+def _packed(weight: NDArray[np.float32], bias: NDArray[np.float32]) -> NDArray[np.float32]:
+    """A layer block by block of outputs, the last one filled up with zeros: biases, then weights input by input."""
+    blocks_n = -(-len(bias) // BLOCK)
+    rows = np.zeros((blocks_n * BLOCK, weight.shape[1] + 1), dtype=np.float32)
+    rows[: len(bias), 0], rows[: len(bias), 1:] = bias, weight
+    return rows.reshape(blocks_n, BLOCK, -1).swapaxes(1, 2).ravel()
 
 
 def check(policy: PolicySnapshot, observation_n: int, action_n: int) -> PolicySnapshot:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from itertools import pairwise
+from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -18,6 +18,7 @@ from t6gps.workers.state import RobotState
 from t6gps.workers.support import SupportFrame, exit_edge
 from t6gps.workers.symmetry import CABLES_FROM, NODES_FROM, world_map
 from t6gps.workers.task import running_cost
+from t6gps.workers.topology import FACE_KINDS
 
 Array = NDArray[np.float64]
 STUCK_SPEED_M_PER_S = 0.05
@@ -38,9 +39,12 @@ class Record:
     means: list[NDArray[np.floating]] = field(default_factory=list)
 
 
-def canonical_vectors(vectors: Array, element: NDArray[np.integer], yaw_rad: Array, labels: NDArray[np.int64]) -> Array:
-    """Relabel and map world vectors [T, n, 3] into the frames of their rows; `labels` [T, n] is a FROM map's rows."""
-    return np.take_along_axis(vectors, labels[:, :, None], axis=1) @ world_map(element, yaw_rad).swapaxes(1, 2)
+def canonical_vectors(vectors: Array, maps: Array, labels: NDArray[np.int64]) -> Array:
+    """Relabel and map world vectors [T, n, 3] into the frames of their rows.
+
+    `maps` [T, 3, 3] are the `world_map`s of the rows, `labels` [T, n] the rows of a FROM map.
+    """
+    return vectors[np.arange(len(vectors))[:, None], labels] @ maps.swapaxes(1, 2)
 
 
 @dataclass(frozen=True)
@@ -56,7 +60,7 @@ class Outcome:
 def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings) -> Episode:
     """The two tables of an episode; whoever hands them on checks them."""
     rows = len(record.states)
-    state = RobotState(*(_stacked([getattr(s, name) for s in record.states]) for name in RobotState.__annotations__))
+    state = RobotState(*(_stacked(list(map(attrgetter(name), record.states))) for name in RobotState.__annotations__))
     element = np.array([frame.element for frame in record.frames])
     yaw = np.array(record.yaws_rad)
     number, waypoint_x, waypoint_y = (np.array(column) for column in zip(*record.waypoints, strict=True))
@@ -69,10 +73,11 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
     speed = np.linalg.norm(velocity, axis=1)
     cost = running_cost(velocity, direction, settings.task)
     frames = record.frames
-    exits = [
-        exit_edge(now, after.face) if after.face != now.face else None
-        for now, after in zip(frames, [*frames[1:], frames[-1]], strict=True)
-    ]
+    face = np.array([frame.face for frame in frames])
+    transitions = np.flatnonzero(np.diff(face))
+    exits: list[int | None] = [None] * rows
+    for row in transitions:
+        exits[row] = exit_edge(frames[row], frames[row + 1].face)
     columns: dict[str, Any] = {
         "episode_id": np.full(rows, plan.episode_id),
         "iteration": np.full(rows, plan.iteration),
@@ -89,16 +94,14 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
         "waypoint_x_m": waypoint_x,
         "waypoint_y_m": waypoint_y,
         "waypoint_distance_m": distance,
-        "face": [frame.face for frame in frames],
-        "kind": [frame.kind for frame in frames],
+        "face": face,
+        "kind": FACE_KINDS[face],
         "entry_edge": [frame.entry_edge for frame in frames],
         "exit_edge": exits,
         "element": element,
         "frame_yaw_rad": yaw,
-        "nodes": canonical_vectors(state.nodes() - com[:, None], element, yaw, NODES_FROM[element]),
-        "node_velocities": canonical_vectors(
-            state.node_velocities() - velocity[:, None], element, yaw, NODES_FROM[element]
-        ),
+        "nodes": canonical_vectors(state.nodes() - com[:, None], maps, NODES_FROM[element]),
+        "node_velocities": canonical_vectors(state.node_velocities() - velocity[:, None], maps, NODES_FROM[element]),
         "com_velocity": np.einsum("tij,tj->ti", maps, velocity),
         "target_direction": np.einsum("tij,tj->ti", maps[:, :2, :2], direction),
         "rest_lengths": np.take_along_axis(state.rest_lengths, CABLES_FROM[element], axis=1),
@@ -129,7 +132,7 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
         "stuck_share_by_distance": stuck_share_by_distance(com),
         "waypoints_reached": outcome.waypoints_reached,
         "path_length_m": float(path),
-        "transitions": sum(a.face != b.face for a, b in pairwise(frames)),
+        "transitions": len(transitions),
         "bar_mass_kg": settings.robot.bar_mass_kg,
         "cable_stiffness_n_per_m": settings.robot.cable_stiffness_n_per_m,
         "friction": settings.robot.friction,
@@ -138,7 +141,7 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
     }
     return Episode(
         pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
-        pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
+        pa.Table.from_pylist([summary], schema=EPISODES),
     )
 
 
@@ -162,9 +165,14 @@ def _column(values: Any, target: pa.Field, rows: int) -> pa.Array:
     """Column of `rows` entries; where a vector column has fewer values, the last entries are null."""
     length = vector_length(target)
     if length is None:
+        if isinstance(values, np.ndarray):
+            values = values.astype(target.type.to_pandas_dtype(), copy=False)  # Arrow's own conversion is slower
         return pa.array(values, target.type)
     filled = len(values)
     flat = np.ascontiguousarray(values, dtype=np.float32).reshape(-1)
-    offsets = np.minimum(np.arange(rows + 1), filled) * length
-    mask = pa.array(np.arange(rows) >= filled) if filled < rows else None
-    return pa.ListArray.from_arrays(pa.array(offsets, pa.int32()), pa.array(flat), type=target.type, mask=mask)
+    offsets = np.arange(0, (rows + 1) * length, length, dtype=np.int32)
+    mask = None
+    if filled < rows:
+        offsets[filled:] = filled * length
+        mask = pa.array(np.arange(rows) >= filled)
+    return pa.ListArray.from_arrays(pa.array(offsets), pa.array(flat), type=target.type, mask=mask)

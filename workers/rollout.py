@@ -11,11 +11,10 @@ from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import exploration, policy
 from t6gps.workers.episode import RunningEpisode
+from t6gps.workers.observer import steer
 from t6gps.workers.physics import Simulation
 from t6gps.workers.recording import Outcome, Record, to_episode
 from t6gps.workers.settings import RolloutSettings
-from t6gps.workers.support import SupportFrame
-from t6gps.workers.symmetry import CABLE_MAP
 
 
 def rollout(
@@ -33,13 +32,15 @@ def rollout(
     `record` of the caller's is filled as the episode goes: it shows how far one came that failed.
     """
 
-    def control(episode: RunningEpisode, _: int) -> NDArray[np.float32]:
-        return policy.act(snapshot, episode.observation)
+    act = policy.ready(snapshot)
+
+    def control(episode: RunningEpisode, _: int) -> NDArray[np.float64]:
+        return act(episode.observation)
 
     return controlled(simulation, settings, plan, control, snapshot.version, snapshot.offset_m, delay_steps, record)
 
 
-Controller = Callable[[RunningEpisode, int], NDArray[np.floating]]
+Controller = Callable[[RunningEpisode, int], NDArray[np.float64]]
 """Canonical rest lengths [24] (m) to command in an episode at a step, before exploration noise."""
 
 
@@ -67,17 +68,15 @@ def controlled(
         delay_steps,
         plan.index,
     )
-    noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation)
+    noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation, plan.steps)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
 
     record = Record() if record is None else record
     _keep(record, episode)
     ended_by = "completed"
-    for step in range(plan.steps):
-        frame = episode.frame
-        mean = control(episode, step)
-        mean = np.minimum(np.maximum(mean, shortest_m), longest_m)
-        command = np.minimum(np.maximum(mean[CABLE_MAP[frame.element]] + next(noise), shortest_m), longest_m)
+    for step, departure in enumerate(noise):
+        wanted = control(episode, step)
+        mean, command, action = steer(wanted, departure, episode.frame.element, shortest_m, longest_m)
         try:
             episode.advance(command)
         except UnsoundStateError as error:
@@ -87,7 +86,7 @@ def controlled(
             ended_by = error.reason
             break
         record.means.append(mean)
-        record.actions.append(canonical_action(command, frame))
+        record.actions.append(action)
         _keep(record, episode)
     outcome = Outcome(version, ended_by, episode.course.reached, delay_steps)
     return to_episode(record, plan, outcome, settings)
@@ -99,10 +98,3 @@ def _keep(record: Record, episode: RunningEpisode) -> None:
     record.yaws_rad.append(episode.yaw_rad)
     record.waypoints.append((episode.course.active, *episode.waypoint))
     record.observations.append(episode.observation)
-
-
-def canonical_action(command: NDArray[np.float64], frame: SupportFrame) -> NDArray[np.float64]:
-    """Commands [24] of the cables in world labels, relabelled for the frame."""
-    action = np.empty_like(command)
-    action[CABLE_MAP[frame.element]] = command
-    return action

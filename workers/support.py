@@ -14,11 +14,15 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.workers.state import RobotState
 from t6gps.workers.symmetry import EDGE_MAP, ELEMENT_BY_EDGE
 from t6gps.workers.topology import DELTA, FACE_KINDS, FACES, LAMBDA, NEIGHBOR_EDGE, NEIGHBOR_FACE
 
 Array = NDArray[np.float64]
 _CORNERS = np.ascontiguousarray(FACES.T)
+_SHARED_EDGE = {
+    (face, int(other)): edge for face, others in enumerate(NEIGHBOR_FACE) for edge, other in enumerate(others)
+}
 
 
 @dataclass(frozen=True)
@@ -59,8 +63,7 @@ def support_face(nodes: Array, com: Array) -> int:
 
 def shared_edge(face: int, other: int) -> int | None:
     """Edge of `face` behind which `other` lies, None if they are not adjacent."""
-    found = np.flatnonzero(NEIGHBOR_FACE[face] == other)
-    return int(found[0]) if len(found) else None
+    return _SHARED_EDGE.get((face, other))
 
 
 def exit_edge(frame: SupportFrame, next_face: int) -> int | None:
@@ -69,13 +72,13 @@ def exit_edge(frame: SupportFrame, next_face: int) -> int | None:
     return None if edge is None else int(EDGE_MAP[frame.element, frame.face, edge])
 
 
-def enter(face: int, previous: SupportFrame | None, nodes: Array, com: Array) -> SupportFrame:
+def enter(face: int, previous: SupportFrame | None, state: RobotState) -> SupportFrame:
     """Frame of a support triangle that has just been entered from `previous` (None at the start of an episode)."""
     kind = int(FACE_KINDS[face])
     left = None if previous is None else shared_edge(previous.face, face)
     edge = None if left is None or previous is None else int(NEIGHBOR_EDGE[previous.face, left])
     if previous is None or edge is None:
-        reference = _nearest_edge(face, nodes, com)
+        reference = _nearest_edge(face, state.nodes(), state.com)
     elif kind == LAMBDA and edge == 0:
         reference = _meeting_edge(face, previous)
     else:

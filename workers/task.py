@@ -62,12 +62,13 @@ class Course:
 
         x, y (m) is the place of the centre of mass.
         """
-        waypoint_x, waypoint_y = self.waypoint()
+        waypoint = waypoint_x, waypoint_y = self.waypoint()
         arrived = hypot(waypoint_x - x, waypoint_y - y) <= WAYPOINT_RADIUS_M
+        if not arrived and time_s - self._since_s < self._timeout_s - 1e-9:
+            return waypoint
         self.reached += arrived
-        if arrived or time_s - self._since_s >= self._timeout_s - 1e-9:
-            self.active += 1
-            self._since_s = time_s
+        self.active += 1
+        self._since_s = time_s
         return self.waypoint()
 
     def waypoint(self) -> tuple[float, float]:

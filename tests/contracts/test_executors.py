@@ -101,4 +101,4 @@ def test_the_policy_is_the_same_in_numpy_and_in_torch() -> None:
     observations = rng.standard_normal((50, 47)).astype(np.float32)
     together = torch_policy.act(snapshot, observations)
     for observation, expected in zip(observations, together, strict=True):
-        assert np.allclose(policy.act(snapshot, observation), expected, atol=1e-6)
+        assert np.allclose(policy.ready(snapshot)(observation), expected, atol=1e-6)

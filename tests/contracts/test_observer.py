@@ -10,7 +10,8 @@ from t6gps.workers.settings import RobotSettings
 from t6gps.workers.start import random_start
 from t6gps.workers.state import RobotState
 from t6gps.workers.support import SupportFrame, enter, support_face
-from t6gps.workers.symmetry import frame_yaw
+from t6gps.workers.symmetry import CABLE_MAP, frame_yaw
+from t6gps.workers.terrain import Terrain, generate
 
 
 @pytest.fixture(scope="module")
@@ -40,7 +41,7 @@ def test_observations_and_turns_are_those_of_the_definition(states: list[RobotSt
     for number, state in enumerate(states):
         nodes, com = state.nodes(), state.com
         face = support_face(nodes, com)
-        frame = enter(face, frame if number % 3 else None, nodes, com)
+        frame = enter(face, frame if number % 3 else None, state)
         target = (0.6, -0.8)
         yaw, observation = observer.observe(state, frame, target, 1.088)
         expected = frame_yaw(nodes, face, frame.element)
@@ -48,6 +49,29 @@ def test_observations_and_turns_are_those_of_the_definition(states: list[RobotSt
         assert np.allclose(observation, observe(state, frame, expected, np.array(target), 1.088), rtol=1e-6, atol=1e-7)
         elements.add(frame.element)
     assert len(elements) > 15
+
+
+def test_extremes_are_those_of_the_nodes_and_the_ground(states: list[RobotState]) -> None:
+    terrain = generate(3, 1.0, size_m=5.0)  # smaller than the way of the robot: many nodes are beyond its sides
+    beyond = 0
+    for state in states:
+        nodes = state.nodes()
+        side, depth = observer.extremes(state, terrain)
+        assert side == pytest.approx(np.abs(nodes[:, :2]).max(), rel=0, abs=1e-13)
+        below = terrain.height(nodes[:, 0], nodes[:, 1]) - nodes[:, 2]
+        assert depth == pytest.approx(below.max(), rel=0, abs=1e-13)
+        beyond += side > terrain.half_size_m
+    assert 0 < beyond < len(states)
+
+
+def test_steering_keeps_to_the_range_and_maps_labels_back() -> None:
+    rng = np.random.default_rng(1)
+    for element in range(24):
+        mean, departure = rng.uniform(0.3, 1.7, 24), rng.normal(size=24)
+        within, command, action = observer.steer(mean, departure, element, 0.5, 1.5)
+        assert np.array_equal(within, mean.clip(0.5, 1.5))
+        assert np.array_equal(command, (within[CABLE_MAP[element]] + departure).clip(0.5, 1.5))
+        assert np.array_equal(action[CABLE_MAP[element]], command)
 
 
 def test_what_does_not_fit_is_refused(states: list[RobotState]) -> None:
@@ -59,5 +83,11 @@ def test_what_does_not_fit_is_refused(states: list[RobotState]) -> None:
     for bad in (short, single):
         with pytest.raises(ValueError, match=r"expected float64 \[6, 3\]"):
             observer.survey(bad)
+    with pytest.raises(ValueError, match=r"expected float64 \[n, n\]"):
+        observer.extremes(state, Terrain(np.zeros((3, 4)), 0.5))
     with pytest.raises(ValueError, match="out of range"):
         observer.observe(state, SupportFrame(20, 0, 0, None), (1.0, 0.0), 1.088)
+    with pytest.raises(ValueError, match="out of range"):
+        observer.steer(np.zeros(24), np.zeros(24), 24, 0.5, 1.5)
+    with pytest.raises(ValueError, match=r"expected float64 \[24, 1\]"):
+        observer.steer(np.zeros(23), np.zeros(24), 0, 0.5, 1.5)

@@ -218,7 +218,7 @@ def test_the_workers_command_what_ppo_commands_on_average() -> None:
     observations = np.random.default_rng(0).uniform(-1, 1, (5, 47)).astype(np.float32)
     for observation in observations:
         commands = 1.0 + 0.5 * model.predict(observation, deterministic=True)[0]
-        np.testing.assert_allclose(policy.act(learner.snapshot, observation), commands, atol=1e-5)
+        np.testing.assert_allclose(policy.ready(learner.snapshot)(observation), commands, atol=1e-5)
 
 
 def test_evolution_spends_its_steps_in_whole_generations() -> None:

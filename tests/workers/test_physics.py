@@ -338,7 +338,7 @@ def test_a_missing_plugin_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPat
 
 
 def test_a_library_without_bullets_functions_is_refused_with_their_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    physics.cull_triangles()  # before the library changes its name
+    physics.take_over()  # before the library changes its name
     monkeypatch.setattr(pybullet, "__file__", str(plugin.library_path()))
     with pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand"):
         Simulation(ROBOT, "plugin")

@@ -103,7 +103,7 @@ def test_row_t_holds_state_t_and_the_action_taken_there(flat: Episode) -> None:
     snapshot = random_policy()
     observations, means = schema.array(frames, "observation"), schema.array(frames, "action_mean")
     for observation, mean in zip(observations[:-1], means, strict=True):
-        assert np.allclose(np.clip(policy.act(snapshot, observation), 0.5, 1.5), mean, atol=1e-6)
+        assert np.allclose(np.clip(policy.ready(snapshot)(observation), 0.5, 1.5), mean, atol=1e-6)
 
 
 def test_without_noise_the_policy_mean_is_the_action(worker: RolloutWorker) -> None:
@@ -122,7 +122,7 @@ def test_canonical_columns_map_back_to_the_world(flat: Episode) -> None:
     bars = [schema.array(frames, name) for name in schema.FRAMES.names if name.startswith("bar_")]
     state = RobotState(*(b.reshape(rows, 6, -1).astype(float) for b in bars), np.zeros((rows, 24)))
     assert np.abs(back - state.nodes()).max() < 1e-5
-    again = canonical_vectors(back - com[:, None], element, yaw, NODES_FROM[element])
+    again = canonical_vectors(back - com[:, None], maps, NODES_FROM[element])
     assert np.abs(again - canonical).max() < 1e-5
 
 
@@ -197,8 +197,8 @@ def test_a_policy_that_does_not_fit_is_refused(worker: RolloutWorker) -> None:
 
 
 def test_exploration_noise_has_its_spread_and_correlation() -> None:
-    stream = noise(np.random.default_rng(0), 0.15, 0.6)
-    samples = np.array([next(stream) for _ in range(4000)])
+    samples = np.array(list(noise(np.random.default_rng(0), 0.15, 0.6, 4000)))
+    assert len(samples) == 4000
     assert samples.std() == pytest.approx(0.15, rel=0.02)
     assert np.mean(samples[1:] * samples[:-1]) / samples.var() == pytest.approx(0.6, abs=0.02)
 

@@ -130,7 +130,7 @@ def _copy(state: RobotState, element: int, yaw: float) -> RobotState:
 
 def _frame(state: RobotState, previous: SupportFrame | None = None) -> tuple[SupportFrame, float]:
     nodes = state.nodes()
-    frame = enter(support_face(nodes, state.com), previous, nodes, state.com)
+    frame = enter(support_face(nodes, state.com), previous, state)
     return frame, frame_yaw(nodes, frame.face, frame.element)
 
 
@@ -180,8 +180,8 @@ def test_all_copies_of_a_state_give_the_same_observation(element: int) -> None:
             # Entered from nowhere, or through each edge in turn.
             if neighbour is not None:
                 origin = int(NEIGHBOR_FACE[first[0].face, neighbour])
-                before = enter(origin, None, state.nodes(), state.com)
-                copied_before = enter(int(FACE_MAP[element, origin]), None, copy.nodes(), copy.com)
+                before = enter(origin, None, state)
+                copied_before = enter(int(FACE_MAP[element, origin]), None, copy)
                 first, later = _frame(state, before), _frame(copy, copied_before)
             assert first[0].entry_edge == later[0].entry_edge
             a = observe(state, *first, target, 1.088)
@@ -196,8 +196,8 @@ def test_the_entry_edge_is_the_reference_edge() -> None:
         face = support_face(state.nodes(), state.com)
         for edge in range(3):
             other = int(NEIGHBOR_FACE[face, edge])
-            previous = enter(other, None, state.nodes(), state.com)
-            frame = enter(face, previous, state.nodes(), state.com)
+            previous = enter(other, None, state)
+            frame = enter(face, previous, state)
             assert frame.entry_edge == (0 if frame.kind == DELTA or edge == 0 else 1)
             assert exit_edge(previous, face) == EDGE_MAP[previous.element, other, NEIGHBOR_EDGE[face, edge]]
 
@@ -208,10 +208,9 @@ def test_labels_map_across_each_kind_of_edge_in_one_way_only() -> None:
     changes: dict[tuple[int, int], set[tuple[int, ...]]] = {}
     for _ in range(300):
         state = _random_state(rng)
-        nodes, com = state.nodes(), state.com
-        previous = enter(int(rng.integers(20)), None, nodes, com)
+        previous = enter(int(rng.integers(20)), None, state)
         for face in NEIGHBOR_FACE[previous.face]:
-            frame = enter(int(face), previous, nodes, com)
+            frame = enter(int(face), previous, state)
             edge = exit_edge(previous, int(face))
             assert edge is not None
             change = tuple(NODE_MAP[frame.element][NODES_FROM[previous.element]])

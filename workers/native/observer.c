@@ -1,8 +1,8 @@
 /*
  * What a worker computes between two control steps: nodes, support triangle, frame and observation of a state.
  *
- * The same definitions as support.support_face, symmetry.frame_yaw and observation.observe, which are the reference
- * that this module is tested against. It holds no robot: `bind` takes the tables of topology and symmetry once.
+ * The same definitions as support.support_face, symmetry.frame_yaw, observation.observe and Terrain.height, which are
+ * the reference that this module is tested against. It holds no robot: `bind` takes the tables of topology and symmetry once.
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -10,6 +10,7 @@
 #include <string.h>
 
 enum { BARS = 6, NODES = 12, CABLES = 24, FACES = 20, ELEMENTS = 24, OBSERVATION = 47 };
+enum { ANY = -1 }; /* rows and columns of a square of any size */
 
 static struct {
     int64_t faces[FACES][3], kinds[FACES], reference_face[2];
@@ -32,9 +33,13 @@ static double at(const struct view *view, int i, int j) {
 static int open_view(PyObject *object, struct view *view, Py_ssize_t rows, Py_ssize_t columns) {
     if (PyObject_GetBuffer(object, &view->buffer, PyBUF_STRIDED_RO | PyBUF_FORMAT) != 0) return -1;
     const Py_buffer *b = &view->buffer;
+    const int square = columns == ANY && b->ndim == 2 && b->shape[0] == b->shape[1] && b->shape[0] > 1;
     const int plain = columns == 1 ? b->ndim == 1 : b->ndim == 2 && b->shape[1] == columns;
-    if (!plain || b->shape[0] != rows || strcmp(b->format, "d") != 0) {
-        PyErr_Format(PyExc_ValueError, "expected float64 [%zd, %zd]", rows, columns);
+    if (!(square || (plain && b->shape[0] == rows)) || strcmp(b->format, "d") != 0) {
+        if (columns == ANY)
+            PyErr_SetString(PyExc_ValueError, "expected float64 [n, n], n above 1");
+        else
+            PyErr_Format(PyExc_ValueError, "expected float64 [%zd, %zd]", rows, columns);
         PyBuffer_Release(&view->buffer);
         return -1;
     }
@@ -125,6 +130,43 @@ static PyObject *survey(PyObject *self, PyObject *const *arguments, Py_ssize_t n
     return Py_BuildValue("iddd", support_face(nodes, com), com[0], com[1], com[2]);
 }
 
+/* Height of the ground at a place, as Terrain.height; heights [n, n]. */
+static double ground_height(const struct view *heights, double cell, double x, double y) {
+    const int last = (int)heights->buffer.shape[0] - 1;
+    const double u = fmin(fmax(x / cell + last / 2.0, 0), last), v = fmin(fmax(y / cell + last / 2.0, 0), last);
+    const int i = u < last ? (int)u : last - 1, j = v < last ? (int)v : last - 1;
+    const double a = u - i, b = v - j, corner = at(heights, i, j), far = at(heights, i + 1, j + 1);
+    const double turning = a >= b ? at(heights, i + 1, j) : at(heights, i, j + 1);
+    return a >= b ? corner + a * (turning - corner) + b * (far - turning)
+                  : corner + b * (turning - corner) + a * (far - turning);
+}
+
+/* extremes(positions [6, 3], orientations [6, 4], heights [n, n], cell) -> (largest |x| or |y|, largest depth) of nodes */
+static PyObject *extremes(PyObject *self, PyObject *const *arguments, Py_ssize_t n) {
+    (void)self;
+    static const Py_ssize_t columns[3] = {3, 4, ANY};
+    struct view views[3];
+    PyObject *result = NULL;
+    int opened = 0;
+    if (n != 4) return PyErr_Format(PyExc_TypeError, "extremes takes 4 arguments");
+    const double cell = PyFloat_AsDouble(arguments[3]);
+    if (PyErr_Occurred()) return NULL;
+    while (opened < 3 && open_view(arguments[opened], &views[opened], opened < 2 ? BARS : ANY, columns[opened]) == 0)
+        opened++;
+    if (opened == 3) {
+        double nodes[NODES][3], side = 0, depth = -INFINITY;
+        find_nodes(&views[0], &views[1], nodes);
+        for (int node = 0; node < NODES; node++) {
+            const double *at_node = nodes[node];
+            side = fmax(side, fmax(fabs(at_node[0]), fabs(at_node[1])));
+            depth = fmax(depth, ground_height(&views[2], cell, at_node[0], at_node[1]) - at_node[2]);
+        }
+        result = Py_BuildValue("dd", side, depth);
+    }
+    while (opened > 0) PyBuffer_Release(&views[--opened].buffer);
+    return result;
+}
+
 static void put_direction(float *out, double yaw, double side, double x, double y) {
     out[0] = (float)(cos(yaw) * x - sin(yaw) * side * y);
     out[1] = (float)(sin(yaw) * x + cos(yaw) * side * y);
@@ -134,21 +176,20 @@ static void put_direction(float *out, double yaw, double side, double x, double 
  * observe(positions, orientations, velocities [6, 3], angular velocities [6, 3], rest lengths [24], face, element,
  *         target x, target y, nominal rest length, out: writable float32 [47]) -> yaw
  */
-static PyObject *observe(PyObject *self, PyObject *arguments) {
+static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n) {
     (void)self;
-    PyObject *objects[5], *out_object;
-    int face, element;
-    double target[2], nominal;
-    if (!PyArg_ParseTuple(arguments, "OOOOOiidddO", &objects[0], &objects[1], &objects[2], &objects[3], &objects[4],
-                          &face, &element, &target[0], &target[1], &nominal, &out_object))
-        return NULL;
+    if (n != 11) return PyErr_Format(PyExc_TypeError, "observe takes 11 arguments");
+    const long face = PyLong_AsLong(objects[5]), element = PyLong_AsLong(objects[6]);
+    const double target[2] = {PyFloat_AsDouble(objects[7]), PyFloat_AsDouble(objects[8])};
+    const double nominal = PyFloat_AsDouble(objects[9]);
+    if (PyErr_Occurred()) return NULL;
     static const Py_ssize_t rows[5] = {BARS, BARS, BARS, BARS, CABLES}, columns[5] = {3, 4, 3, 3, 1};
     struct view views[5];
     Py_buffer out_buffer;
     PyObject *result = NULL;
     int opened = 0;
     while (opened < 5 && open_view(objects[opened], &views[opened], rows[opened], columns[opened]) == 0) opened++;
-    if (opened < 5 || PyObject_GetBuffer(out_object, &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) != 0) goto release;
+    if (opened < 5 || PyObject_GetBuffer(objects[10], &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) != 0) goto release;
     const int fits = out_buffer.len == OBSERVATION * (Py_ssize_t)sizeof(float) && strcmp(out_buffer.format, "f") == 0;
     if (!fits || face < 0 || face >= FACES || element < 0 || element >= ELEMENTS) {
         PyErr_SetString(PyExc_ValueError, "observe: face, element or output out of range");
@@ -156,7 +197,7 @@ static PyObject *observe(PyObject *self, PyObject *arguments) {
         double nodes[NODES][3], velocity[3];
         find_nodes(&views[0], &views[1], nodes);
         mean_row(&views[2], velocity);
-        const double yaw = frame_yaw(nodes, face, element), side = tables.proper[element] ? 1.0 : -1.0;
+        const double yaw = frame_yaw(nodes, (int)face, (int)element), side = tables.proper[element] ? 1.0 : -1.0;
         const double c = cos(yaw), s = sin(yaw);
         float *out = out_buffer.buf;
         out[0] = (float)tables.kinds[face];
@@ -183,6 +224,48 @@ release:
     return result;
 }
 
+static double within(double value, double low, double high) { return value < low ? low : value > high ? high : value; }
+
+/*
+ * steer(mean float64 [24] in canonical labels, departure [24] in world labels, element, shortest, longest,
+ *       out: writable float64 [3, 24]): mean within the range, command in world labels, the same in canonical labels
+ */
+static PyObject *steer(PyObject *self, PyObject *const *objects, Py_ssize_t n) {
+    (void)self;
+    if (n != 6) return PyErr_Format(PyExc_TypeError, "steer takes 6 arguments");
+    const long element = PyLong_AsLong(objects[2]);
+    const double shortest = PyFloat_AsDouble(objects[3]), longest = PyFloat_AsDouble(objects[4]);
+    if (PyErr_Occurred()) return NULL;
+    struct view mean, departure;
+    Py_buffer out_buffer;
+    if (open_view(objects[0], &mean, CABLES, 1) != 0) return NULL;
+    if (open_view(objects[1], &departure, CABLES, 1) != 0) {
+        PyBuffer_Release(&mean.buffer);
+        return NULL;
+    }
+    int done = 0;
+    if (PyObject_GetBuffer(objects[5], &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) == 0) {
+        const int fits = out_buffer.len == 3 * CABLES * (Py_ssize_t)sizeof(double) && strcmp(out_buffer.format, "d") == 0;
+        if (!fits || element < 0 || element >= ELEMENTS) {
+            PyErr_SetString(PyExc_ValueError, "steer: element or output out of range");
+        } else {
+            double *means = out_buffer.buf, *command = means + CABLES, *action = command + CABLES;
+            for (int cable = 0; cable < CABLES; cable++) {
+                const int from = (int)tables.cables_from[element][cable];
+                means[cable] = within(at(&mean, cable, 0), shortest, longest);
+                action[cable] = within(means[cable] + at(&departure, from, 0), shortest, longest);
+                command[from] = action[cable];
+            }
+            done = 1;
+        }
+        PyBuffer_Release(&out_buffer);
+    }
+    PyBuffer_Release(&mean.buffer);
+    PyBuffer_Release(&departure.buffer);
+    if (!done) return NULL;
+    Py_RETURN_NONE;
+}
+
 /* bind(bytes of the tables in the order of the struct) */
 static PyObject *bind(PyObject *self, PyObject *bytes) {
     (void)self;
@@ -198,7 +281,9 @@ static PyObject *bind(PyObject *self, PyObject *bytes) {
 static PyMethodDef methods[] = {
     {"bind", bind, METH_O, "Take the tables of topology and symmetry."},
     {"survey", (PyCFunction)(void (*)(void))survey, METH_FASTCALL, "Support face and centre of mass of a state."},
-    {"observe", observe, METH_VARARGS, "Write the observation of a state; returns the turn of its frame."},
+    {"extremes", (PyCFunction)(void (*)(void))extremes, METH_FASTCALL, "Farthest side and largest depth of the nodes."},
+    {"observe", (PyCFunction)(void (*)(void))observe, METH_FASTCALL, "Write the observation of a state; returns the turn of its frame."},
+    {"steer", (PyCFunction)(void (*)(void))steer, METH_FASTCALL, "Write mean, command and action of a control step."},
     {NULL, NULL, 0, NULL},
 };
 
