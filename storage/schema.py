@@ -108,6 +108,10 @@ EPISODES = _schema(
     _scalar("delay_steps", pa.int32(), "1", "control steps from a command to its effect"),
 )
 
+_POLICY_KL = _scalar(
+    "policy_kl", pa.float64(), "nat", "mean KL divergence of the new policy from the one that sampled", nullable=True
+)
+
 ITERATIONS = _schema(
     _scalar("iteration", pa.int32(), "1", "iteration, counted from 0"),
     _scalar("policy_version", pa.int32(), "1", "version of the policy that sampled"),
@@ -133,13 +137,7 @@ ITERATIONS = _schema(
     _scalar("backward_pass_s", pa.float64(), "s", "duration"),
     _scalar("supervised_s", pa.float64(), "s", "duration"),
     _scalar("supervised_loss_before", pa.float64(), "1", "the same error of the policy that sampled", nullable=True),
-    _scalar(
-        "policy_kl",
-        pa.float64(),
-        "nat",
-        "mean KL divergence of the new policy from the one that sampled",
-        nullable=True,
-    ),
+    _POLICY_KL,
     _scalar(
         "saturated_share",
         pa.float64(),
@@ -171,13 +169,7 @@ CLASSES = _schema(
         "mean predicted change of that cost per step; null when every step is a jump",
         nullable=True,
     ),
-    _scalar(
-        "policy_kl",
-        pa.float64(),
-        "nat",
-        "mean KL divergence of the new policy from the one that sampled",
-        nullable=True,
-    ),
+    _POLICY_KL,
 )
 
 TABLES = {"frames": FRAMES, "episodes": EPISODES, "iterations": ITERATIONS, "classes": CLASSES}

@@ -123,7 +123,9 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
             found.append(episode)
             if len(found) == 5:
                 victim = house.workers[rng.integers(2)]
-                time.sleep(rng.uniform(0, EPISODE_S))  # any point of an episode
+                time.sleep(
+                    rng.uniform(0, EPISODE_S)
+                )  # no wait: it draws the point of the episode at which the fault comes
                 os.kill(pid(victim), signal.SIGKILL)
         house.check(found)
         wait_until(lambda: house.ready(2), 90)
