@@ -118,15 +118,11 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
     rng = np.random.default_rng(0)
     crashed_n = house.executor.pool.counters["crashed"]
     for _ in range(3):
-        found = []
+        found, moment = [], rng.integers(1, 6)
         for episode in house.sample():
             found.append(episode)
-            if len(found) == 5:
-                victim = house.workers[rng.integers(2)]
-                time.sleep(
-                    rng.uniform(0, EPISODE_S)
-                )  # no wait: it draws the point of the episode at which the fault comes
-                os.kill(pid(victim), signal.SIGKILL)
+            if len(found) == moment:  # the worker that sent it begins another, the other one is somewhere in its own
+                os.kill(pid(house.workers[rng.integers(2)]), signal.SIGKILL)
         house.check(found)
         wait_until(lambda: house.ready(2), 90)
     assert house.executor.pool.counters["crashed"] == crashed_n + 3
