@@ -15,8 +15,8 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.workers.bullet import pybullet
-from t6gps.workers.contacts import take_over
 from t6gps.workers.observer import extremes
+from t6gps.workers.overrides import take_over
 from t6gps.workers.plugin import PluginStepper
 from t6gps.workers.reference import ReferenceStepper, read_state
 from t6gps.workers.settings import RobotSettings

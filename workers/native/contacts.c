@@ -9,15 +9,13 @@
  * process_triangle takes the place of btConvexTriangleCallback::processTriangle in that class's table of virtual
  * functions. The declarations are those of PyBullet 3.2.7, in double precision.
  */
-#define _GNU_SOURCE
 #include <math.h>
 #include <stddef.h>
 #include <stdint.h>
-#include <sys/mman.h>
-#include <unistd.h>
+
+#include "override.h"
 
 enum { CAPSULE = 10 };          /* type of shape */
-enum { PROCESS_TRIANGLE = 4 };  /* entry of its class's table, after two of RTTI and two destructors */
 enum { ADD_CONTACT_POINT = 4 }; /* entry of an object's table, after two destructors and two setters of identifiers */
 
 typedef double vector[4]; /* btVector3: the fourth is padding */
@@ -202,17 +200,8 @@ static void process_triangle(struct callback *callback, const vector *corners, i
     ((add_function)callback->result->vtable[ADD_CONTACT_POINT])(callback->result, normal, point, distance - thickness);
 }
 
-/* Puts process_triangle in place, once in a process; false if the table is not the expected one. */
-int take_over(uintptr_t vtable, uintptr_t expected) {
-    void **entry = (void **)vtable + PROCESS_TRIANGLE;
-    void *const ours = (void *)(uintptr_t)process_triangle;
-    if (*entry == ours) return 1;
-    if (*entry != (void *)expected) return 0;
-    const uintptr_t page_size = (uintptr_t)sysconf(_SC_PAGESIZE);
-    void *page = (void *)((uintptr_t)entry & ~(page_size - 1));
-    if (mprotect(page, page_size, PROT_READ | PROT_WRITE)) return 0;
+/* Puts process_triangle in place; false if the table is not the expected one. */
+int override_triangles(void **table, void *expected) {
     measure = (process_function)expected;
-    *entry = ours;
-    mprotect(page, page_size, PROT_READ);
-    return 1;
+    return override(table, expected, (void *)(uintptr_t)process_triangle);
 }

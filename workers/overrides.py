@@ -1,4 +1,4 @@
-"""The binding of workers/native/contacts.c, which finds the contacts of bars and triangles in place of Bullet."""
+"""Compiled functions of ours in the place of virtual ones of Bullet: contacts (contacts.c) and solver (solver.c)."""
 
 from __future__ import annotations
 
@@ -6,6 +6,7 @@ import ctypes
 import struct
 from functools import cache
 from importlib.machinery import EXTENSION_SUFFIXES
+from itertools import chain
 from pathlib import Path
 
 import numpy as np
@@ -13,8 +14,18 @@ import numpy as np
 from t6gps.workers.bullet import pybullet
 
 _EXPORTED = "b3InitStepSimulationCommand"
-_TABLE = "_ZTV24btConvexTriangleCallback"
-_FUNCTION = "_ZN24btConvexTriangleCallback15processTriangleEP9btVector3ii"
+_OVERRIDES = {
+    "override_triangles": (
+        "_ZTV24btConvexTriangleCallback",
+        "_ZN24btConvexTriangleCallback15processTriangleEP9btVector3ii",
+    ),
+    "override_iterations": (
+        "_ZTV27btMultiBodyConstraintSolver",
+        "_ZN35btSequentialImpulseConstraintSolver33solveGroupCacheFriendlyIterationsEPP17btCollisionObjectiPP20"
+        "btPersistentManifoldiPP17btTypedConstraintiRK19btContactSolverInfoP12btIDebugDraw",
+    ),
+}
+"""Functions that install an override: the symbols of Bullet's table of virtual functions and of the one replaced."""
 _SYMBOL = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"), ("size", "<u8")]
 )
@@ -23,25 +34,24 @@ _SYMBOL_TABLE = 2
 
 def library_path() -> Path | None:
     """The compiled functions beside this file, None if they were not built."""
-    candidates = [Path(__file__).with_name(f"_contacts{suffix}") for suffix in EXTENSION_SUFFIXES]
+    candidates = [Path(__file__).with_name(f"_overrides{suffix}") for suffix in EXTENSION_SUFFIXES]
     return next((candidate for candidate in candidates if candidate.exists()), None)
 
 
 @cache
 def take_over() -> bool:
-    """Put the compiled functions in the place of Bullet's, for every client of this process.
+    """Install the overrides, for every client of this process.
 
     False where it cannot be done: they were not built, or this build of pybullet is not the one they were made for.
     """
-    path = library_path()
-    values = _symbols(Path(pybullet.__file__), [_EXPORTED, _TABLE, _FUNCTION])
-    if path is None or len(values) < 3:
+    path, symbols = library_path(), [_EXPORTED, *chain(*_OVERRIDES.values())]
+    values = _symbols(Path(pybullet.__file__), symbols)
+    if path is None or len(values) < len(symbols):
         return False
-    exported = ctypes.cast(getattr(ctypes.CDLL(pybullet.__file__), _EXPORTED), ctypes.c_void_p).value
-    base = (exported or 0) - values[_EXPORTED]
-    install = ctypes.CDLL(str(path)).take_over
-    install.argtypes = [ctypes.c_size_t, ctypes.c_size_t]
-    return bool(install(base + values[_TABLE], base + values[_FUNCTION]))
+    exported = ctypes.cast(getattr(ctypes.CDLL(pybullet.__file__), _EXPORTED), ctypes.c_void_p).value or 0
+    addresses = {symbol: ctypes.c_void_p(exported - values[_EXPORTED] + value) for symbol, value in values.items()}
+    library = ctypes.CDLL(str(path))
+    return all(library[name](addresses[table], addresses[function]) for name, (table, function) in _OVERRIDES.items())
 
 
 def _symbols(library: Path, names: list[str]) -> dict[str, int]:

@@ -1,16 +1,18 @@
-"""Closest points of segments and triangles are that, and the robot moves as with Bullet's own algorithm."""
+"""Closest points of segments and triangles are that; the robot moves as with Bullet alone, others just as with it."""
 
 from __future__ import annotations
 
 import ctypes
 import subprocess
 import sys
+from functools import partial
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.workers import contacts, physics
+from t6gps.workers import overrides, physics
+from t6gps.workers.bullet import pybullet
 from t6gps.workers.physics import Simulation, neutral_state
 from t6gps.workers.settings import RobotSettings
 from t6gps.workers.terrain import generate
@@ -44,7 +46,7 @@ def _closest(start: Array, along: Array, corners: Array, reach_m: float = np.inf
     padded, found = np.zeros((3, 4)), _Closest()
     padded[:, :3] = corners
     pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (start, along, padded)]
-    library = ctypes.CDLL(str(contacts.library_path()))
+    library = ctypes.CDLL(str(overrides.library_path()))
     near = library.closest_points(*pointers, ctypes.c_double(reach_m), ctypes.byref(found))
     return found if near else None
 
@@ -84,30 +86,75 @@ def test_a_segment_along_a_triangle_has_its_distance() -> None:
 
 
 def _motion() -> Array:
-    """Positions of the bars over 2 s on three rough grounds [3, 20, 6, 3] (m)."""
+    """Positions of the bars over 2 s on three rough grounds and on the plane [4, 20, 6, 3] (m)."""
     rng = np.random.default_rng(3)
     motions = []
     with Simulation(RobotSettings()) as simulation:
-        for seed in range(3):
-            simulation.set_ground(generate(seed, 1.0))
+        for terrain in [*(generate(seed, 1.0) for seed in range(3)), None]:
+            simulation.set_ground(terrain)
             simulation.reset(neutral_state(simulation.robot, 1.9))
             commands = rng.uniform(0.5, 1.5, (20, CABLES_N))
             motions.append([simulation.control_step(command).bar_positions for command in commands])
     return np.array(motions)
 
 
-def test_motion_is_that_of_bullet_s_own_distances(tmp_path: Path) -> None:
-    assert contacts.take_over()
-    subprocess.run([sys.executable, __file__, tmp_path / "own.npy"], check=True)
-    assert np.abs(np.load(tmp_path / "own.npy") - _motion()).max() < 1e-9
+def _motion_of_boxes(addition: str) -> Array:
+    """Positions of boxes that fall on each other, over 1 s [240, boxes, 3] (m), with what is left to Bullet's solver.
+
+    addition: a "rigid" body on them or "apart", "rolling" friction, a "joint" between two, or a box with a "link".
+    """
+    client = pybullet.connect(pybullet.DIRECT)
+    pybullet.setGravity(0, 0, -9.81, physicsClientId=client)
+    create = partial(pybullet.createMultiBody, physicsClientId=client)
+    plane = pybullet.createCollisionShape(pybullet.GEOM_PLANE, physicsClientId=client)
+    box = pybullet.createCollisionShape(pybullet.GEOM_BOX, halfExtents=[0.2, 0.2, 0.2], physicsClientId=client)
+    create(0, plane, useMaximalCoordinates=True)
+    bodies = [create(1, box, basePosition=[0.1 * i, 0, 0.3 + 0.5 * i]) for i in range(1 if addition == "apart" else 4)]
+    if addition in ("rigid", "apart"):
+        position = [0.2, 0.1, 2.5] if addition == "rigid" else [3.0, 0.0, 0.3]
+        bodies.append(create(1, box, basePosition=position, useMaximalCoordinates=True))
+    elif addition == "rolling":
+        pybullet.changeDynamics(bodies[0], -1, rollingFriction=0.1, spinningFriction=0.1, physicsClientId=client)
+    elif addition == "joint":
+        ends = [[0, 0, 0], [0.5, 0, 0], [-0.5, 0, 0]]
+        pybullet.createConstraint(
+            bodies[0], -1, bodies[2], -1, pybullet.JOINT_POINT2POINT, *ends, physicsClientId=client
+        )
+    else:
+        link = {"Masses": [1], "CollisionShapeIndices": [box], "VisualShapeIndices": [-1], "Positions": [[0.5, 0, 0]]}
+        link |= {"Orientations": [[0, 0, 0, 1]], "InertialFramePositions": [[0, 0, 0]], "ParentIndices": [0]}
+        link |= {"InertialFrameOrientations": [[0, 0, 0, 1]], "JointTypes": [0], "JointAxis": [[0, 1, 0]]}
+        named = {f"link{name}": value for name, value in link.items()}
+        bodies.append(create(1, box, basePosition=[0.2, 0.1, 2.5], **named))
+        pybullet.setJointMotorControl2(bodies[-1], 0, pybullet.VELOCITY_CONTROL, force=0, physicsClientId=client)
+    motion = []
+    for _ in range(240):
+        pybullet.stepSimulation(physicsClientId=client)
+        motion.append([pybullet.getBasePositionAndOrientation(body, physicsClientId=client)[0] for body in bodies])
+    pybullet.disconnect(physicsClientId=client)
+    return np.array(motion)
+
+
+def _motions() -> dict[str, Array]:
+    return {"bars": _motion()} | {
+        name: _motion_of_boxes(name) for name in ("rigid", "apart", "rolling", "joint", "link")
+    }
+
+
+def test_motion_is_that_of_bullet_alone(tmp_path: Path) -> None:
+    assert overrides.take_over()
+    subprocess.run([sys.executable, __file__, tmp_path / "own.npz"], check=True)
+    with np.load(tmp_path / "own.npz") as own:
+        for name, motion in _motions().items():
+            assert np.abs(own[name] - motion).max() < 1e-9, name
 
 
 def test_a_library_without_bullet_has_none_of_its_symbols() -> None:
-    path = contacts.library_path()
+    path = overrides.library_path()
     assert path is not None
-    assert set(contacts._symbols(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {"closest_points"}
+    assert set(overrides._symbols(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {"closest_points"}
 
 
 if __name__ == "__main__":
     physics.take_over = lambda: False
-    np.save(sys.argv[1], _motion())
+    np.savez(sys.argv[1], **_motions())
