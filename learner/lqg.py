@@ -1,7 +1,7 @@
 """Backward pass of linear-quadratic-Gaussian control with a KL term (paper Sec. II-A, III-F; Algorithm 2, line 10).
 
-All sub-trajectories of equal length T are solved at once; the first axis is the sub-trajectory, the second is
-time. Everything is expressed in deviations around the recorded states x and actions u.
+Sub-trajectories of equal length T are solved in one call; the first axis is the sub-trajectory, the second is time.
+Everything is expressed in deviations around the recorded states x and actions u.
 
     F          slopes of the surrogate dynamics      dx[t+1] = F[t] [dx[t]; du[t]],  F = [Fx Fu]
     P, S       surrogate policy                      slopes and (diagonal) covariance
@@ -25,7 +25,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.learner import _backward
 from t6gps.learner.modes import Models
+from t6gps.storage.errors import DataError
 
 Array = NDArray[np.floating]
 Ints = NDArray[np.int64]
@@ -42,76 +44,69 @@ class Improvement:
                             acts from the recorded first state on in the surrogate models [b, T] (m2/s2)
     """
 
-    K: Array
-    k: Array
-    predicted_cost_change: Array
+    K: NDArray[np.float32]
+    k: NDArray[np.float32]
+    predicted_cost_change: NDArray[np.float32]
 
 
 @dataclass(frozen=True)
 class LqgModels:
     """What the backward pass needs of each of k models: F and the KL terms c S^-1, c S^-1 P and c P' S^-1 P."""
 
-    F: Array
-    precision: Array
-    precision_P: Array
-    P_precision_P: Array
+    F: NDArray[np.float32]
+    precision: NDArray[np.float32]
+    precision_P: NDArray[np.float32]
+    P_precision_P: NDArray[np.float32]
 
 
-def prepare(
-    models: Models, kl_weight: float, variance_m2: float | None = None, dtype: type[np.floating] = np.float32
-) -> LqgModels:
-    """Model table of the backward pass, which has its precision; `variance_m2` replaces the fitted S when given."""
+def prepare(models: Models, kl_weight: float, variance_m2: float | None = None) -> LqgModels:
+    """Model table of the backward pass, in its single precision; `variance_m2` replaces the fitted S when given."""
     fitted = models.variance if variance_m2 is None else np.full_like(models.variance, variance_m2)
     precision = kl_weight / np.maximum(fitted, ACTION_VARIANCE_FLOOR_M2)
     precision_P = precision[:, :, None] * models.P
     both = np.swapaxes(models.P, 1, 2) @ precision_P
-    return LqgModels(*(array.astype(dtype) for array in (models.F, precision, precision_P, both)))
+    return LqgModels(*map(_single, (models.F, precision, precision_P, both)))
+
+
+def _single(array: Array) -> NDArray[np.float32]:
+    return np.ascontiguousarray(array, dtype=np.float32)
 
 
 def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Array, deviation: Array) -> Improvement:
-    """Improved local policies along sub-trajectories of one length.
+    """Improved local policies along sub-trajectories of one length (learner/native/backward.c).
 
     model      model of each step in the table [b, T]
     gradient   h of the state after each step [b, T, nx];   hessian   H [nx, nx]
     deviation  dev [b, T, nu]
+
+    DataError if Quu is not positive definite somewhere, as with models that are not finite.
     """
     count, length, nx = gradient.shape
     nu = deviation.shape[2]
-    K = np.empty((count, length, nu, nx), dtype=models.F.dtype)
-    k = np.empty((count, length, nu), dtype=models.F.dtype)
-    gradient, hessian, deviation = (array.astype(K.dtype, copy=False) for array in (gradient, hessian, deviation))
-    V = np.broadcast_to(hessian, (count, nx, nx))
-    v = gradient[:, -1]
-    for t in reversed(range(length)):
-        F, pull = models.F[model[:, t]], models.precision[model[:, t]]
-        Q = np.swapaxes(F, 1, 2) @ (V @ F)
-        q = (v[:, None] @ F)[:, 0]
-        weighted_P = models.precision_P[model[:, t]]
-        Quu = Q[:, nx:, nx:]
-        Quu[:, np.arange(nu), np.arange(nu)] += pull
-        Qux = Q[:, nx:, :nx] - weighted_P
-        qu = q[:, nx:] + pull * deviation[:, t]
-        gains = -np.linalg.solve(Quu, np.concatenate([Qux, qu[:, :, None]], axis=2))
-        K[:, t], k[:, t] = gains[:, :, :nx], gains[:, :, nx]
-        if t == 0:
-            break
-        Qxu = np.swapaxes(Qux, 1, 2)
-        V = Q[:, :nx, :nx] + models.P_precision_P[model[:, t]] + Qxu @ K[:, t]
-        V = (V + np.swapaxes(V, 1, 2)) / 2 + hessian
-        qx = q[:, :nx] - (deviation[:, t, None] @ weighted_P)[:, 0]
-        v = qx + (Qxu @ k[:, t, :, None])[:, :, 0] + gradient[:, t - 1]
-    return Improvement(K, k, _predicted_change(models, model, gradient, hessian, K, k))
-
-
-def _predicted_change(models: LqgModels, model: Ints, gradient: Array, hessian: Array, K: Array, k: Array) -> Array:
-    """Forward pass: what the improved policy changes in the running cost [b, T], by the models."""
-    dx = np.zeros_like(gradient[:, 0])
-    change = np.empty(gradient.shape[:2], dtype=gradient.dtype)
-    for t in range(gradient.shape[1]):
-        du = k[:, t] + (K[:, t] @ dx[:, :, None])[:, :, 0]
-        dx = (models.F[model[:, t]] @ np.concatenate([dx, du], axis=1)[:, :, None])[:, :, 0]
-        change[:, t] = ((gradient[:, t] + dx @ hessian / 2) * dx).sum(axis=1)
-    return change
+    found = Improvement(
+        np.empty((count, length, nu, nx), dtype=np.float32),
+        np.empty((count, length, nu), dtype=np.float32),
+        np.empty((count, length), dtype=np.float32),
+    )
+    failed = _backward.improve(
+        models.F,
+        models.precision,
+        models.precision_P,
+        models.P_precision_P,
+        np.ascontiguousarray(model, dtype=np.int64),
+        _single(gradient),
+        _single(hessian),
+        _single(deviation),
+        found.K,
+        found.k,
+        found.predicted_cost_change,
+    )
+    if failed >= 0:
+        raise DataError(
+            f"the backward pass cannot improve sub-trajectory {failed} of {count}, whose Quu is not positive definite; "
+            "its models are not finite or too steep: use a larger learner.kl_weight or learner.prior_samples"
+        )
+    return found
 
 
 def sub_trajectories(continues: NDArray[np.bool_], horizon_steps: int) -> dict[int, Ints]:

@@ -45,8 +45,8 @@ def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None
             assert f"t6gps/{room}/{module.name}" in names
     for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
         assert f"t6gps/deploy/presets/{preset.name}" in names
-    for library in ("_stepper", "_overrides", "_observer", "_policy"):
-        assert f"t6gps/workers/{library}{sysconfig.get_config_var('EXT_SUFFIX')}" in names
+    for module in SETUPTOOLS["ext-modules"]:
+        assert f"{module['name'].replace('.', '/')}{sysconfig.get_config_var('EXT_SUFFIX')}" in names
     assert all(name.startswith(("t6gps/", "t6gps-")) for name in names)
 
 

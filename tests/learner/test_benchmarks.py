@@ -26,7 +26,7 @@ def test_phases_are_measured_and_compared_at_equal_inliers_and_gains(
     assert result["steps"] == 12 * 80 and result["pairs"] == 2 * 12 * 80
     assert all(result[key] > 0 for key in benchmarks.PHASES.values())
     assert result["fit_speedup_over_sklearn"] > 1 and result["backward_pass_speedup_over_loop"] > 1
-    assert result["gain_error"] < 1e-9 < result["gain_error_float32"] < 1e-4
+    assert 0 < result["gain_error"] < 1e-6
     assert 0 < result["inlier_share"] <= 1 and 0 < result["sklearn_inlier_share"] <= 1
 
 

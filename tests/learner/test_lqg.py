@@ -9,8 +9,10 @@ import pytest
 from numpy.typing import NDArray
 
 from t6gps.learner import cost, lqg
+from t6gps.learner.benchmarks import plain_backward_pass
 from t6gps.learner.features import Rows
 from t6gps.learner.modes import Models
+from t6gps.storage.errors import DataError
 
 NX, NU, T, B, C = 5, 3, 6, 4, 0.05
 Array = NDArray[np.float64]
@@ -146,27 +148,45 @@ def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
 
 
 @pytest.mark.parametrize("variance", [0.02, 0.0])
-def test_single_precision_equals_double_precision_to_four_digits(variance: float) -> None:
-    """At the robot's size: 39 states, 24 actions, 10 steps; also for a policy without noise, whose S has its floor."""
-    nx, nu, length, b = 39, 24, 10, 20
+@pytest.mark.parametrize("nx", [3, 39, 75])
+def test_a_plain_loop_in_double_precision_gives_the_same_to_four_digits(nx: int, variance: float) -> None:
+    """At sizes of the robot, 24 actions and 10 steps; also for a policy without noise, whose S has its floor."""
+    nu, length, b = 24, 10, 20
     rng = np.random.default_rng(0)
-    F = rng.normal(0, 0.13, (b, nx, nx + nu))  # spectral radius about 0.8
-    F[:, -3:] = -F[:, -6:-3]  # dependent rows, as of nodes about the centre of mass
+    F = rng.normal(0, 0.8 / np.sqrt(nx), (b, nx, nx + nu))  # spectral radius about 0.8
+    F[:, -1:] = -F[:, -2:-1]  # dependent rows, as of nodes about the centre of mass
     P = rng.normal(0, 0.1, (b, nu, nx))
     models = Models(F, np.zeros((b, nx)), P, np.zeros((b, nu)), np.full((b, nu), 0.02))
     model = rng.integers(0, b, (b, length))
     target = rng.normal(size=(b, length, 2))
     target /= np.linalg.norm(target, axis=2, keepdims=True)
     gradient = cost.gradient(rng.normal(0, 0.5, (b, length, nx)), target, 0.8, 0.1)
-    deviation = rng.normal(0, np.sqrt(variance), (b, length, nu))
-    single, double = (
-        lqg.backward_pass(lqg.prepare(models, 0.02, variance, dtype), model, gradient, cost.hessian(nx, 0.1), deviation)
-        for dtype in (np.float32, np.float64)
-    )
-    for name in ("K", "k", "predicted_cost_change"):
-        one, other = getattr(single, name), getattr(double, name)
-        assert one.dtype == np.float32 and other.dtype == np.float64
-        assert np.abs(one - other).max() < 1e-4 * np.abs(other).max(), name
+    hessian, deviation = cost.hessian(nx, 0.1), rng.normal(0, np.sqrt(variance), (b, length, nu))
+    found = lqg.backward_pass(lqg.prepare(models, 0.02, variance), model, gradient, hessian, deviation)
+    for one in range(b):
+        given = gradient[one], hessian, deviation[one]
+        K, k, change = plain_backward_pass(F[model[one]], P[model[one]], variance, 0.02, *given)
+        assert np.abs(found.K[one] - K).max() < 1e-4 * np.abs(K).max()
+        assert np.abs(found.k[one] - k).max() < 1e-4 * np.abs(k).max()
+        assert found.predicted_cost_change[one].sum() == pytest.approx(change, rel=1e-3)
+
+
+def test_models_that_are_not_finite_are_refused() -> None:
+    case = problem()
+    case.models.F[case.index[1, 2], 0, 0] = np.nan
+    with pytest.raises(DataError, match=r"sub-trajectory 1 of 4, whose Quu is not positive definite.*kl_weight"):
+        case.solve()
+
+
+@pytest.mark.parametrize("changed", ["index beyond the table", "deviation of another length"])
+def test_arrays_that_do_not_fit_together_are_refused(changed: str) -> None:
+    case = problem()
+    if changed == "index beyond the table":
+        case.index[0, 0] = len(case.models.F)
+    else:
+        case.deviation = case.deviation[:, :-1]
+    with pytest.raises(ValueError, match="other types or shapes"):
+        case.solve()
 
 
 @pytest.mark.parametrize("horizon", [1, 7, 10, 1000])
