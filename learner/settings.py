@@ -47,12 +47,12 @@ class LearnerSettings(Settings):
     prior_samples: float = Field(500.0, ge=0.0, le=1e6, description="weight of the pooled model, n0 (samples)")
     ridge: float = Field(1e-3, gt=0.0, le=1.0, description="ridge relative to the variance of a regressor")
     horizon_steps: int = Field(10, ge=1, le=1000, description="length of a sub-trajectory (steps)")
-    kl_weight: float = Field(0.02, gt=0.0, le=100.0, description="weight of the KL term, c (m2/s2)")
+    kl_weight: float = Field(0.05, gt=0.0, le=100.0, description="weight of the KL term, c (m2/s2)")
     deviation_from: Literal["recorded", "fitted"] = Field(
         "recorded", description="the KL term is centred on the recorded policy mean or on the fitted p(x)"
     )
     hidden_layers: tuple[LayerWidth, ...] = Field(
-        (256, 256, 256), strict=False, min_length=1, max_length=8, description="tanh units per hidden layer"
+        (128, 128, 128), strict=False, min_length=1, max_length=8, description="tanh units per hidden layer"
     )
     epochs: int = Field(8, ge=1, le=1000, description="passes over the pairs per S-step")
     batch: int = Field(512, ge=1, le=100_000, description="pairs per gradient step")

@@ -36,7 +36,6 @@ OFFSPRING_N, PARENTS_N = 12, 4
 FIRST_SPREAD, SPREAD_DECAY = 0.5, 0.97
 """Standard deviation of the first generation, in units of `gaits.WAVE_SCALE_M`, and its factor per generation."""
 EVOLUTION_STEPS = 100
-HIDDEN_LAYERS = (256, 256, 256)
 PPO_OPTIONS: dict[str, Any] = {"n_steps": 2048, "batch_size": 256, "gamma": 0.95, "device": "cpu"}
 """Beside stable-baselines3's defaults: a horizon of about two seconds, as long as sub-trajectories look ahead."""
 
@@ -143,14 +142,14 @@ def new_ppo(config: Config) -> Any:
     from t6gps.workers.environment import SuperBallEnvironment
 
     environment = TimeLimit(SuperBallEnvironment(config.robot, config.task, config.terrain), config.run.steps)
-    network = {"net_arch": list(HIDDEN_LAYERS), "activation_fn": Tanh, "log_std_init": -1.0}
+    network = {"net_arch": list(config.learner.hidden_layers), "activation_fn": Tanh, "log_std_init": -1.0}
     return PPO("MlpPolicy", environment, policy_kwargs=network, seed=config.run.seed, **PPO_OPTIONS)
 
 
 def learner_state(model: Any, config: Config) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
     """State of a learner (`Learner.restore`) whose policy commands the mean action of a PPO model."""
-    weights = model.policy.state_dict()
-    names = [*(f"mlp_extractor.policy_net.{2 * number}" for number in range(len(HIDDEN_LAYERS))), "action_net"]
+    weights, hidden_n = model.policy.state_dict(), len(config.learner.hidden_layers)
+    names = [*(f"mlp_extractor.policy_net.{2 * number}" for number in range(hidden_n)), "action_net"]
     arrays = {
         f"layer_{number}_{part}": weights[f"{name}.{part}"].numpy().astype(np.float32)
         for number, name in enumerate(names)

@@ -9,6 +9,8 @@ from t6gps.storage.records import EpisodePlan
 
 TRAINING, LEARNER, EVALUATION, EVALUATION_TERRAIN = range(4)
 """First spawn key below the run's seed; the learner room uses LEARNER = 1 for its own streams."""
+QUIET = 0.2
+"""Factor of the noise in quiet episodes."""
 
 
 def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
@@ -21,11 +23,21 @@ def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
             episode_id=iteration * size + index,
             iteration=iteration,
             index=index,
-            noise_std_m=config.exploration.noise_std_m,
+            noise_std_m=_noise_std_m(config, iteration, index),
             version=iteration,
         )
         for index in range(size)
     ]
+
+
+def _noise_std_m(config: Config, iteration: int, index: int) -> float:
+    """Exploration noise of a training episode; quiet ones are spread evenly, and there are none in iteration 0.
+
+    They show where the policy rests when no noise moves it on; the untrained one rests everywhere.
+    """
+    exploration = config.exploration
+    quiet = int((index + 1) * exploration.quiet_share) > int(index * exploration.quiet_share)
+    return exploration.noise_std_m * (QUIET if iteration and quiet else 1.0)
 
 
 def evaluation_plans(

@@ -67,6 +67,13 @@ class Study:
 PAPER = ("run.episodes=300", "run.steps=250", "run.iterations=5")
 """Sizes of the paper (Sec. IV-A, V-B): N = 300, T = 250, 5 iterations."""
 PAPER_SEEDS = 3
+PAPER_COST = ("task.target_speed_m_per_s=0.8", "learner.kl_weight=0.02")
+PAPER_NETWORK = ("learner.hidden_layers=[256, 256, 256]",)
+AS_IN_THE_PAPER = (*PAPER_COST, *PAPER_NETWORK)
+"""Cost and network of the paper (Sec. IV-A, IV-C), under which its claims are checked.
+
+The KL term weighs as much beside the gradient of the cost as it does by default.
+"""
 FAST = ("fast", "winch 0.70 m/s", "robot.winch_speed_m_per_s=0.7")
 SLOW = ("slow", "winch 0.30 m/s", "robot.winch_speed_m_per_s=0.3")
 SHRUNK = ("", "", "learner.prior_samples=500")
@@ -77,7 +84,7 @@ def _arms(levels: Mapping[str, tuple[str, ...]], priors: tuple[tuple[str, str, s
     """Every level (label -> overrides) at both winch speeds and with each of `priors`, on rough ground."""
     return {
         "-".join(filter(None, (label.replace("+", "-").replace(" ", "-"), winch, prior))): Arm(
-            label, panel + title, "rough", (*overrides, speed, shrinkage)
+            label, panel + title, "rough", (*AS_IN_THE_PAPER, *overrides, speed, shrinkage)
         )
         for prior, title, shrinkage in priors
         for winch, panel, speed in (FAST, SLOW)
@@ -110,6 +117,16 @@ LOCALIZATIONS = {
 }
 """T6-GPS as it is, the alternatives that the paper names, and the departures of docs/algorithm.md undone one by one."""
 
+BEYOND = {
+    "default": ("v* = 2 m/s", ()),
+    "v08": ("v* = 0.8 m/s", PAPER_COST),
+    "v12": ("v* = 1.2 m/s", ("task.target_speed_m_per_s=1.2", "learner.kl_weight=0.03")),
+    "v40": ("v* = 4 m/s", ("task.target_speed_m_per_s=4", "learner.kl_weight=0.1")),
+    "256-units": ("256 units", PAPER_NETWORK),
+    "quiet": ("a quarter quiet", ("exploration.quiet_share=0.25",)),
+}
+"""The default; other target speeds of the cost, the paper's own with its network; episodes with less noise."""
+
 CHANGED_WORLDS = {
     "flat": ("terrain.difficulty=0",),
     "half-rough": ("terrain.difficulty=0.5",),
@@ -125,6 +142,8 @@ CHANGED_WORLDS = {
     "stiffness-4000": ("robot.cable_stiffness_n_per_m=4000",),
     "winch-0.35": ("robot.winch_speed_m_per_s=0.35",),
     "winch-1.0": ("robot.winch_speed_m_per_s=1.0",),
+    "sensor-noise-0.1": ("randomisation.sensor_noise=0.1",),
+    "sensor-noise-0.3": ("randomisation.sensor_noise=0.3",),
     "delay-0-to-2": ("randomisation.largest_delay_steps=2",),
     "all-spread-20": tuple(
         f"randomisation.{key}_spread=0.2" for key in ("mass", "stiffness", "friction", "winch_speed")
@@ -188,8 +207,18 @@ STUDIES = {
             "The seconds of learning are in the table."
         ),
         arms={
-            label.replace(" ", "-"): Arm(label, "winch 0.70 m/s", "rough", (FAST[2], *overrides))
+            label.replace(" ", "-"): Arm(label, "winch 0.70 m/s", "rough", (*AS_IN_THE_PAPER, FAST[2], *overrides))
             for label, overrides in LOCALIZATIONS.items()
+        },
+        quick=("run.episodes=40",),
+        quick_seeds=2,
+    ),
+    "beyond": Study(
+        question="What do target speeds of the cost, a smaller network than the paper's and quiet episodes change?",
+        arms={
+            f"{name}-{preset}": Arm(label, f"{preset} ground", preset, overrides)
+            for preset in ("flat", "rough")
+            for name, (label, overrides) in BEYOND.items()
         },
         quick=("run.episodes=40",),
         quick_seeds=2,

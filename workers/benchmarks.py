@@ -65,12 +65,12 @@ def episode_overhead(repeats: int = 9) -> dict[str, float]:
     """What an episode of 250 control steps costs beside its control steps, as shares of them; median over episodes.
 
     episode_overhead_share, rough_episode_overhead_share    on the plane, and on the paper's ground: start, frames,
-                                                            observation, policy (3 x 256 units), recording
+                                                            observation, policy (3 x 128 units), recording
     rough_ground_share                                      making that ground in Bullet, once in an episode
     """
     settings = RolloutSettings()
     rng = np.random.default_rng(0)
-    widths = [OBSERVATION_N, 256, 256, 256, CABLES_N]
+    widths = [OBSERVATION_N, 128, 128, 128, CABLES_N]
     layers = tuple(
         ((rng.standard_normal((b, a)) / np.sqrt(a)).astype(np.float32), np.zeros(b, dtype=np.float32))
         for a, b in pairwise(widths)

@@ -16,13 +16,16 @@ from t6gps.workers.start import random_start, rest_start
 from t6gps.workers.support import SupportFrame, enter
 from t6gps.workers.task import Course, one_direction, random_waypoints
 
+SENSOR_STREAM = 4
+"""Branch of an episode's seed; start, course and exploration come first, then the robot (`worker`)."""
+
 
 class RunningEpisode:
     """The robot on its way; it depends on the arguments and the commands alone, whatever the simulation did before.
 
     state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
     waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
-    observation               what the policy sees now [47]
+    observation               what the policy sees now [47], with the noise of the sensors if they have any
     course                    progress along the waypoints
     noise_rng                 the stream for exploration; start and course have streams of their own
 
@@ -48,6 +51,8 @@ class RunningEpisode:
         terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
         simulation.set_ground(terrain)
         self._simulation = simulation
+        self._sensor_noise = settings.randomisation.sensor_noise
+        self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
         self._nominal_m = nominal_m
         self._step = 0
         if task.directions:
@@ -79,3 +84,6 @@ class RunningEpisode:
         distance = hypot(way_x, way_y)
         self.target = (way_x / distance, way_y / distance)
         self.yaw_rad, self.observation = observe(self.state, self.frame, self.target, self._nominal_m)
+        if self._sensor_noise:
+            readings = self.observation[1:]  # the support triangle is known
+            readings += self._sensor_noise * self._sensor_rng.standard_normal(len(readings), dtype=np.float32)

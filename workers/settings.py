@@ -52,7 +52,7 @@ class TaskSettings(Settings):
         le=360,
         description="0: random starts and waypoints; J > 0: one rest state, episode i heads for direction i modulo J",
     )
-    target_speed_m_per_s: float = Field(0.8, gt=0.0, le=5.0, description="v* of the cost (m/s)")
+    target_speed_m_per_s: float = Field(2.0, gt=0.0, le=5.0, description="v* of the cost (m/s)")
     vertical_weight: float = Field(0.1, gt=0.0, le=1.0, description="weight of the vertical velocity in the cost")
 
     @model_validator(mode="after")
@@ -67,15 +67,17 @@ class ExplorationSettings(Settings):
 
     noise_std_m: float = Field(0.15, ge=0.0, le=1.0, description="standard deviation per cable (m)")
     noise_correlation: float = Field(0.6, ge=0.0, lt=1.0, description="first-order correlation from step to step")
+    quiet_share: float = Field(0.0, ge=0.0, le=1.0, description="share of episodes with a fifth of the noise")
 
 
 class RandomisationSettings(Settings):
-    """Domain randomisation: how far the robots of single episodes spread around the configured one."""
+    """Domain randomisation: how far robots of single episodes spread around the configured one, and how they sense."""
 
     mass_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the bars' mass")
     stiffness_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the cables' stiffness")
     friction_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the friction")
     winch_speed_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the winch speed")
+    sensor_noise: float = Field(0.0, ge=0.0, le=1.0, description="noise on every reading (units of the observation)")
     largest_delay_steps: int = Field(0, ge=0, le=10, description="largest delay of commands (control steps)")
 
 

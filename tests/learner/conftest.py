@@ -144,8 +144,9 @@ def make_frames() -> Callable[..., pa.Table]:
 @pytest.fixture
 def make_learner() -> Callable[..., Learner]:
     def make(fit_map: Any = map, run_seed: int = 3, **settings: Any) -> Learner:
+        small = {"hidden_layers": (16,), "epochs": 2, "smallest_class_segments": 10, "kl_weight": 0.02}
         return Learner(
-            LearnerSettings(**{"hidden_layers": (16,), "epochs": 2, "smallest_class_segments": 10} | settings),
+            LearnerSettings(**small | settings),
             run_seed=run_seed,
             target_speed_m_per_s=0.8,
             vertical_weight=0.1,

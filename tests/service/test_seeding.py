@@ -1,7 +1,7 @@
 """Laws of the random streams."""
 
 from t6gps.service.config import load
-from t6gps.service.seeding import evaluation_plans, training_plans
+from t6gps.service.seeding import QUIET, evaluation_plans, training_plans
 
 
 def test_plans_depend_on_configuration_and_iteration_alone() -> None:
@@ -30,3 +30,11 @@ def test_the_terrain_seed_of_an_evaluation_changes_the_ground_alone() -> None:
     assert [p.seed for p in a] == [p.seed for p in b]
     assert not {p.terrain_seed for p in a} & {p.terrain_seed for p in b}
     assert all(p.noise_std_m == 0 for p in a + b)
+
+
+def test_quiet_episodes_are_spread_evenly_from_the_second_iteration_on() -> None:
+    config = load("rough", ["run.episodes=40", "exploration.noise_std_m=0.1", "exploration.quiet_share=0.25"])
+    assert {plan.noise_std_m for plan in training_plans(config, 0)} == {0.1}
+    noises = [plan.noise_std_m for plan in training_plans(config, 1)]
+    assert noises == [0.1, 0.1, 0.1, 0.1 * QUIET] * 10
+    assert {plan.noise_std_m for plan in evaluation_plans(config, 8, 0, None, 1)} == {0.0}

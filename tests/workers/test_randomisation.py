@@ -76,3 +76,17 @@ def test_a_delayed_command_acts_that_many_steps_later() -> None:
         tracks[delay] = np.abs(np.diff(schema.array(episode.frames, "rest_lengths"), axis=0)).max(axis=1)
     moving = {delay: int(np.flatnonzero(track > 1e-6)[0]) for delay, track in tracks.items()}
     assert moving == {0: 0, 3: 3}
+
+
+def test_noisy_sensors_blur_what_the_policy_sees_and_nothing_else() -> None:
+    episodes = []
+    for noise in (0.0, 0.3):
+        worker = RolloutWorker(RolloutSettings(randomisation=RandomisationSettings(sensor_noise=noise)))
+        episodes.append(worker.run(PLAN, still_policy()))  # it commands the same whatever it sees
+        worker.close()
+    clear, blurred = (schema.array(episode.frames, "observation") for episode in episodes)
+    errors = (blurred - clear)[:, 1:]
+    assert np.array_equal(blurred[:, 0], clear[:, 0])
+    assert 0.27 < errors.std() < 0.33 and abs(errors.mean()) < 0.03
+    assert np.abs(np.corrcoef(errors[:-1].ravel(), errors[1:].ravel())[0, 1]) < 0.1
+    assert episodes[0].frames.drop_columns("observation").equals(episodes[1].frames.drop_columns("observation"))

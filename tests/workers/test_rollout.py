@@ -225,7 +225,7 @@ def test_the_next_waypoint_comes_on_arrival_or_after_five_seconds() -> None:
 
 
 def test_the_cost_vanishes_at_the_target_velocity_and_weighs_the_vertical_less() -> None:
-    settings, direction = TaskSettings(), np.array([0.6, 0.8])
+    settings, direction = TaskSettings(target_speed_m_per_s=0.8), np.array([0.6, 0.8])
     wanted = np.array([0.48, 0.64, 0.0])
     assert running_cost(wanted, direction, settings) == pytest.approx(0.0, abs=1e-15)
     assert running_cost(np.zeros(3), direction, settings) == pytest.approx(0.64)
