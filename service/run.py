@@ -107,6 +107,7 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
     learned, classes = executor.ask("report")
     ordered = [episodes[plan.episode_id] for plan in plans if plan.episode_id in episodes]
     row = {"iteration": iteration, "policy_version": iteration, **_sampled(ordered), **learned, **durations}
+    row["left_out"] = len(plans) - len(ordered)
     tables.commit_iteration(run, iteration, ordered, row, classes)
     manifest, arrays = executor.ask("state")
     checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)

@@ -15,9 +15,9 @@ from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
 
-SCHEMA_VERSION = 2
-"""Grows with every change. Version 2 added columns at the end of `iterations` and `classes`; they are nullable,
-since the runs of version 1 have none."""
+SCHEMA_VERSION = 3
+"""Grows with every change. Versions 2 and 3 added columns at the end of `iterations`, version 2 of `classes`; they are
+nullable, since older runs have none."""
 OBSERVATION_N = 47
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction."""
 
@@ -145,6 +145,7 @@ ITERATIONS = _schema(
         "share of noise-free commands at an end of the command range",
         nullable=True,
     ),
+    _scalar("left_out", pa.int32(), "1", "planned episodes that kept failing and are not in the data", nullable=True),
 )
 
 CLASSES = _schema(

@@ -86,7 +86,9 @@ def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(
 ) -> None:
     trained(this, {POISON})
     assert tables.read(this, "episodes")["episode_id"].to_pylist() == [0, 2]
-    assert tables.read(this, "iterations")["episodes"].to_pylist() == [2]
+    assert tables.read(this, "iterations").select(["episodes", "left_out"]).to_pylist() == [
+        {"episodes": 2, "left_out": 1}
+    ]
     latest = checkpoint.load_latest(this.checkpoints)
     assert latest is not None
     ledger: Any = latest[1]["ledger"]
