@@ -36,9 +36,10 @@ check: install
 bench: install
 	$(BIN)/t6gps bench physics
 
-# Half an hour of workers killed, stopped and scaled at random; the figures are printed at the end.
+# Twenty kills, a learner that pauses for a minute, and half an hour of workers killed, stopped and scaled at random;
+# the figures are printed at the end.
 soak: install
-	T6GPS_SOAK_MINUTES=30 $(BIN)/pytest -s tests/faults/test_soak.py
+	T6GPS_SOAK_MINUTES=30 $(BIN)/pytest -s tests/faults/test_workers.py tests/faults/test_soak.py -k 't1_ or t13 or t14'
 
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

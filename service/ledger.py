@@ -3,7 +3,7 @@
     planned -> leased (slot, incarnation) -> arrived -> committed
        ^          |                             |
        +----------+   given back, failed        +-> dropped and counted when nobody waits for it any more
-                  +-> quarantined after three failures
+                  +-> quarantined after three failures of its own
 
 Committed means durable in the spool. The ledger knows neither processes nor the time: `pool` finds out which leases
 have outlived their deadline.
@@ -19,11 +19,12 @@ from typing import Any
 from t6gps.service.sampler import Failure
 from t6gps.storage.records import EpisodePlan
 
-FAILURES_ALLOWED_N = 3
-"""An episode that has failed this often is quarantined."""
+FAILURES_ALLOWED_N, ATTEMPTS_ALLOWED_N = 3, 10
+"""An episode is quarantined when it has failed so often, or was tried in vain so often: an attempt that is lost with
+its process or its node counts only as the latter, for ten in a row in the same episode are no accident."""
 HOPELESS_N, HOPELESS_LATER_N = 5, 20
 """So many quarantined episodes in a row, before and after a first one was committed, mean that nothing works."""
-COUNTERS = ("committed", "duplicates", "late", "expired", "given_back", "failures", "quarantined")
+COUNTERS = ("committed", "duplicates", "late", "expired", "given_back", "lost", "failures", "quarantined")
 
 
 @dataclass(frozen=True)
@@ -133,8 +134,8 @@ class Ledger:
         return [lease.plan for lease in returned]
 
     def fail(self, plan: EpisodePlan, failure: Failure) -> bool:
-        """An attempt failed. The plan goes back to the queue; True when it is quarantined, after its third failure."""
-        self.counters["failures"] += 1
+        """An attempt failed or was lost. The plan goes back to the queue; True when it is quarantined now."""
+        self.counters["lost" if failure.kind == "lost" else "failures"] += 1
         self.counters["expired"] += failure.kind == "hang"
         lease = self._leases.get(plan.episode_id)
         if lease is None or lease.plan != plan:
@@ -142,7 +143,8 @@ class Ledger:
         del self._leases[plan.episode_id]
         history = self.failures.setdefault(plan.episode_id, [])
         history.append(failure)
-        if len(history) < FAILURES_ALLOWED_N:
+        own_n = sum(failure.kind != "lost" for failure in history)
+        if own_n < FAILURES_ALLOWED_N and len(history) < ATTEMPTS_ALLOWED_N:
             self._waiting.appendleft(plan)
             return False
         self.quarantined.add(plan.episode_id)

@@ -67,7 +67,7 @@ def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) 
         *waits,
     ]
     if found["quarantined"]:
-        lines.append(f"left out after three failures: episodes {', '.join(map(str, found['quarantined']))}")
+        lines.append(f"left out for their failures: episodes {', '.join(map(str, found['quarantined']))}")
     typer.echo("\n".join(lines))
     if found["workers"]:
         display.print_rows("Workers", found["workers"], WORKER_COLUMNS)
@@ -102,7 +102,7 @@ def say_what_is_left_out(run: Run) -> None:
         for number in sorted(bundle.kept(run.bundles, purpose)):
             path = run.bundles / f"{purpose}-{number}.json"
             console.print(
-                f"{purpose} {number} failed three times and is left out; look into it with: t6gps replay {path}",
+                f"{purpose} {number} failed again and again and is left out; look into it with: t6gps replay {path}",
                 highlight=False,
                 soft_wrap=True,
             )

@@ -12,7 +12,6 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
-from dataclasses import dataclass, field
 from typing import Any
 
 from t6gps.service import control
@@ -20,6 +19,7 @@ from t6gps.service.control import Control
 from t6gps.service.deadlines import EpisodeTimes
 from t6gps.service.ledger import Ledger
 from t6gps.service.sampler import Failure
+from t6gps.service.slots import Slot, Worker
 from t6gps.service.transport import Alive, Died, Done, Handle, Identity, Ready, Report, Transport
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan
@@ -27,7 +27,6 @@ from t6gps.storage.records import Episode, EpisodePlan
 PLANS_PER_WORKER = 2
 BYTES_IN_FLIGHT = 2**30
 """Half of the embedded object store: episodes under way count with the size of the largest seen."""
-FIRST_BACK_OFF_S, LONGEST_BACK_OFF_S = 0.5, 30.0
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
 START_DEADLINE_S = 180.0
@@ -38,36 +37,6 @@ CAPACITY_S = 1.0
 """How often the cluster is asked for room."""
 SHRINK_AFTER_S = 30.0
 """Autoscaling gives a worker up after it was not needed for so long: the learner's phases are shorter."""
-
-
-@dataclass
-class Worker:
-    """An incarnation of a slot. `plans` are its leases in their order: it is at work on the first."""
-
-    slot: int
-    incarnation: int
-    handle: Handle
-    since_s: float
-    phase: str = "starting"
-    identity: Identity | None = None
-    plans: deque[EpisodePlan] = field(default_factory=deque)
-    draining: bool = False
-    placed: bool = True
-    pinged_s: float = -math.inf
-    answered: bool = True
-    deadline_s: float = math.inf
-
-    def __str__(self) -> str:
-        return f"slot {self.slot}, incarnation {self.incarnation}"
-
-
-@dataclass
-class Slot:
-    """What is remembered of a slot from one incarnation to the next."""
-
-    incarnations_n: int = 0
-    failures_n: int = 0
-    retry_s: float = -math.inf
 
 
 class Pool:
@@ -236,10 +205,7 @@ class Pool:
         self.ledger.give_back(worker.slot, worker.incarnation)
 
     def _mourn(self, worker: Worker, now: float, kind: str, error: str, message: str) -> None:
-        slot = self._slots[worker.slot]
-        slot.failures_n += 1
-        if slot.failures_n > 1:  # the first time costs nothing
-            slot.retry_s = now + min(FIRST_BACK_OFF_S * 2 ** (slot.failures_n - 2), LONGEST_BACK_OFF_S)
+        self._slots[worker.slot].failed(now)
         self._last_trouble = f"worker {worker}: {error}: {message}"
         if worker.phase == "starting":
             self._failed_starts_n += 1
@@ -247,6 +213,7 @@ class Pool:
         if worker.plans:
             plan = worker.plans[0]
             where = f"{worker}" + (f", process {worker.identity.pid}" if worker.identity else "")
+            kind = "lost" if remains.blameless else kind
             failure = Failure(kind, error, message, plan.seed, None, remains.stacks, [], where, remains.log)
             self._failed(plan, failure)
 
@@ -383,18 +350,7 @@ class Pool:
             "phase": self.phase,
             "wanted": self.wanted,
             "ready": sum(worker.phase != "starting" and not worker.draining for worker in self.workers.values()),
-            "workers": [
-                {
-                    "slot": worker.slot,
-                    "incarnation": worker.incarnation,
-                    "pid": worker.identity and worker.identity.pid,
-                    "node": worker.identity and worker.identity.node,
-                    "phase": "draining" if worker.draining else worker.phase,
-                    "for_s": round(now - worker.since_s, 3),
-                    "episodes": [plan.episode_id for plan in worker.plans],
-                }
-                for worker in self.workers.values()
-            ],
+            "workers": [worker.status(now) for worker in self.workers.values()],
             "backlog": self.ledger.backlog,
             "leases": len(self.ledger.leases),
             "arrived": self.ledger.arrived,

@@ -9,11 +9,13 @@ import faulthandler
 import os
 import signal
 import time
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
 
 STACKS_S = 0.3
-LOG_TAIL_BYTES = 4000
+LOG_TAIL_BYTES = 8000
+FAULT = "Fatal Python error"
 
 
 @dataclass(frozen=True)
@@ -33,15 +35,17 @@ def dump_stacks_on_signal() -> Process:
     return Process(os.getpid(), _stat(os.getpid())[1], descriptor)
 
 
+def stopped(process: Process) -> bool:
+    """True when somebody has stopped a process of this machine (SIGSTOP)."""
+    return _state(process) == "T"
+
+
 def stacks(process: Process) -> str:
     """Stacks of a process of this machine, or what can be said in their place."""
-    try:
-        state, started = _stat(process.pid)
-    except OSError:
+    state = _state(process)
+    if state in ("", "Z"):
         return "the process has ended"
-    if started != process.started or state == "Z":
-        return "the process has ended"
-    if state == "T":
+    if stopped(process):
         return "the process is stopped (SIGSTOP): it has no stack to show"
     file = Path(f"/proc/{process.pid}/fd/{process.stacks}")
     try:
@@ -57,11 +61,9 @@ def stacks(process: Process) -> str:
 
 def kill(process: Process) -> None:
     """End a process of this machine at once, also a stopped one; one that has ended already is left alone."""
-    try:
-        if _stat(process.pid)[1] == process.started:
+    with suppress(ProcessLookupError):
+        if _state(process):
             os.kill(process.pid, signal.SIGKILL)
-    except (FileNotFoundError, ProcessLookupError):
-        pass
 
 
 def log_tail(folder: Path, pid: int) -> str:
@@ -71,6 +73,20 @@ def log_tail(folder: Path, pid: int) -> str:
         content = path.read_bytes()[-LOG_TAIL_BYTES:]
         text += content.decode(errors="replace")
     return text
+
+
+def fault_in(log: str) -> bool:
+    """True when a process said in its log how it failed in C; Ray has every process do so."""
+    return FAULT in log
+
+
+def _state(process: Process) -> str:
+    """State letter of a process of this machine, empty when it is no more."""
+    try:
+        state, started = _stat(process.pid)
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+    return state if started == process.started else ""
 
 
 def _stat(pid: int) -> tuple[str, int]:

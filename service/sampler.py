@@ -16,7 +16,8 @@ from t6gps.storage.spool import checked
 class Failure:
     """Why an attempt at an episode gave no data.
 
-    kind     "raised" in the worker, "crash" of its process, or "hang": no result before its deadline
+    kind     "raised" in the worker, "crash" of its process, "hang": no result before its deadline, or "lost": the
+             process was killed or stopped from outside, or its node is gone
     error    type of the exception, or how the process ended
     trace    traceback, or the stacks of a process that hung, as far as they could be had
     step     control step that was being taken, None when unknown

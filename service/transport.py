@@ -65,10 +65,14 @@ Report = Ready | Alive | Done | Died
 
 @dataclass(frozen=True)
 class Remains:
-    """What could be learned of a worker from outside before it was killed."""
+    """What could be learned of a worker from outside before it was killed.
+
+    blameless   somebody else ended or stopped it, or its node is gone: the episode in hand is not the cause
+    """
 
     stacks: str = ""
     log: str = ""
+    blameless: bool = False
 
 
 class Transport(ABC):

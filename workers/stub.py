@@ -7,6 +7,7 @@ holds for ever. So an order reaches whichever process comes to it, and outlives 
 
 from __future__ import annotations
 
+import ctypes
 import os
 import time
 from collections.abc import Callable
@@ -111,6 +112,12 @@ def _exit(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
     os._exit(1)
 
 
+def _fault(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
+    """The process faults in C."""
+    ctypes.string_at(0)
+    return episode(plan, snapshot)
+
+
 def _with(name: str, change: Callable[[pa.Array], pa.Array]) -> Callable[[EpisodePlan, PolicySnapshot], Episode]:
     def broken(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
         whole = episode(plan, snapshot)
@@ -139,6 +146,7 @@ ORDERS: dict[str, Callable[[EpisodePlan, PolicySnapshot], Episode]] = {
     "hang-in-python": _hang_in_python,
     "hang-in-c": _hang_in_c,
     "exit": _exit,
+    "fault": _fault,
     "slow": episode,
     "nan": _with("cost", _nan),
     "wrong-type": _with("cost", lambda column: column.cast(pa.float32())),

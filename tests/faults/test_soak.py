@@ -23,7 +23,7 @@ from t6gps.learner import policy
 from t6gps.service import deadlines, seeding
 from t6gps.service.actors import RayExecutor
 from t6gps.service.config import Config
-from t6gps.service.pool import Worker
+from t6gps.service.slots import Worker
 from t6gps.storage import catalog, durable, schema
 from t6gps.storage.records import EpisodePlan
 from t6gps.workers.stub import StubWorker

@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from t6gps.service.ledger import FAILURES_ALLOWED_N, HOPELESS_N, Ledger
+from t6gps.service.ledger import ATTEMPTS_ALLOWED_N, FAILURES_ALLOWED_N, HOPELESS_N, Ledger
 from t6gps.service.sampler import Failure
 from t6gps.storage.records import EpisodePlan
 
@@ -95,6 +95,24 @@ def test_an_episode_that_fails_three_times_is_quarantined_and_nothing_else_is(le
     assert ledger.quarantined == {0}
     assert len(ledger.failures[0]) == FAILURES_ALLOWED_N
     assert (ledger.counters["failures"], ledger.counters["quarantined"]) == (3, 1)
+
+
+def test_an_episode_whose_worker_is_lost_is_innocent_until_no_accident_explains_it(ledger: Ledger) -> None:
+    (plan,) = plans(1)
+    ledger.open([plan])
+    for attempt in range(1, ATTEMPTS_ALLOWED_N + 1):
+        assert ledger.lease(0, 1) == plan
+        assert ledger.fail(plan, failure("lost")) == (attempt == ATTEMPTS_ALLOWED_N)
+    assert (ledger.counters["lost"], ledger.counters["failures"]) == (ATTEMPTS_ALLOWED_N, 0)
+
+
+def test_lost_attempts_do_not_add_to_failures(ledger: Ledger) -> None:
+    (plan,) = plans(1)
+    ledger.open([plan])
+    kinds = ["lost", "crash", "lost", "lost", "hang", "lost", "raised"]
+    for kind in kinds:
+        ledger.lease(0, 1)
+        assert ledger.fail(plan, failure(kind)) == (kind == "raised")
 
 
 def test_quarantined_episodes_are_left_out_of_a_new_book(ledger: Ledger) -> None:

@@ -14,6 +14,7 @@ from t6gps.service.deadlines import FACTOR, SHORTEST_S, EpisodeTimes
 from t6gps.service.ledger import Ledger
 from t6gps.service.pool import PLANS_PER_WORKER, Pool
 from t6gps.service.sampler import Failure
+from t6gps.service.slots import LONGEST_BACK_OFF_S
 from t6gps.service.transport import Alive, Died, Done, Handle, Identity, Ready, Remains, Report, Transport
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -237,7 +238,7 @@ def test_back_off_is_capped_and_a_slot_that_cannot_start_does_not_end_a_run_that
     house.paper.die(house.pool.workers[1].handle)
     house.run(300)
     times = [at for slot, _, at in house.paper.starts if slot == 1]
-    assert times[-1] - times[-2] == pytest.approx(supervising.LONGEST_BACK_OFF_S + START_S, abs=0.21)
+    assert times[-1] - times[-2] == pytest.approx(LONGEST_BACK_OFF_S + START_S, abs=0.21)
     assert house.pool.state == "DEGRADED"
     assert "the process ended" in house.pool.reason
 

@@ -1,0 +1,122 @@
+"""An executor with stub workers that obey orders, and the policy and plans of one book after another."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import contextmanager
+from functools import partial
+from itertools import pairwise
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import ray
+from ray.cluster_utils import Cluster
+
+from t6gps.service import cluster, seeding
+from t6gps.service.actors import RayExecutor
+from t6gps.service.config import Config
+from t6gps.service.slots import Worker
+from t6gps.storage import catalog, schema
+from t6gps.storage.records import Episode, PolicySnapshot
+from t6gps.workers import stub
+from t6gps.workers.stub import StubWorker
+
+EPISODE_S, RUN = 0.1, "faults"
+CONFIG = {"run": {"episodes": 30, "steps": 20, "workers": 2, "cpus_per_worker": 0.5}}
+
+QUICK_HEALTH_CHECKS = {
+    "RAY_health_check_initial_delay_ms": "1000",
+    "RAY_health_check_period_ms": "1000",
+    "RAY_health_check_timeout_ms": "2000",
+    "RAY_health_check_failure_threshold": "3",
+}
+"""For a cluster's head: a node that dies or is cut off is noticed within seconds."""
+
+NODE = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
+
+
+@contextmanager
+def three_nodes() -> Iterator[Cluster]:
+    """A cluster of three nodes of one CPU on this machine, to which RAY_ADDRESS leads."""
+    with pytest.MonkeyPatch.context() as environment:
+        for name, value in QUICK_HEALTH_CHECKS.items():
+            environment.setenv(name, value)
+        found = Cluster(initialize_head=True, head_node_args=NODE)
+        try:
+            for _ in range(2):
+                found.add_node(**NODE)
+            environment.setenv("RAY_ADDRESS", found.address)
+            yield found
+        finally:
+            ray.shutdown()
+            found.shutdown()
+
+
+def others(nodes: Cluster) -> dict[str, Any]:
+    """Nodes that the run can do without, by their names: neither the head nor the supervisor's."""
+    return {node.node_id: node for node in nodes.worker_nodes if node.node_id != cluster.this_node()}
+
+
+class House:
+    """An executor with stub workers, its orders, and one book after another."""
+
+    def __init__(self, root: Path, config: dict[str, Any] | None = None) -> None:
+        self.config = Config.model_validate(config or CONFIG)
+        self.run = catalog.create(root, RUN, self.config.to_json())
+        self.orders = root / "orders"
+        self.orders.mkdir()
+        make = partial(StubWorker, episode_s=EPISODE_S, orders=self.orders)
+        self.executor = RayExecutor(self.config, self.run, make)
+        self.iteration = -1
+
+    def order(self, episode: int, what: str) -> int:
+        """Order a fault for an episode of the next book."""
+        number = (self.iteration + 1) * self.config.run.episodes + episode
+        (self.orders / f"episode-{number}").write_text(what)
+        return number
+
+    def sample(self) -> Iterator[Episode]:
+        """A new book, with a policy of its own."""
+        self.iteration += 1
+        yield from self.executor.sample(self.plans, policy(self.iteration))
+
+    @property
+    def plans(self) -> list[Any]:
+        return seeding.training_plans(self.config, self.iteration)
+
+    @property
+    def workers(self) -> list[Worker]:
+        return list(self.executor.pool.workers.values())
+
+    def ready(self, n: int) -> bool:
+        """Tick; True when there are n workers and all are ready."""
+        pool = self.executor.pool
+        pool.tick(0.02)
+        return len(self.workers) == n and pool.state == "RUNNING"
+
+    def check(self, found: list[Episode], without: tuple[int, ...] = ()) -> None:
+        """Every planned episode is there once, and it is what the plan alone makes of it."""
+        numbers = [episode.summary["episode_id"][0].as_py() for episode in found]
+        expected = {plan.episode_id: plan for plan in self.plans if plan.episode_id not in without}
+        assert sorted(numbers) == sorted(expected)
+        for number, episode in zip(numbers, found, strict=True):
+            alone = stub.episode(expected[number], policy(self.iteration))
+            assert episode.frames.equals(alone.frames)
+            assert episode.summary.equals(alone.summary)
+
+
+def policy(version: int) -> PolicySnapshot:
+    rng = np.random.default_rng(version)
+    widths = [schema.OBSERVATION_N, 8, 24]
+    layers = tuple(
+        (rng.standard_normal((b, a)).astype(np.float32), np.zeros(b, np.float32)) for a, b in pairwise(widths)
+    )
+    return PolicySnapshot(version, layers, 1.0, 0.2)
+
+
+def pid(worker: Worker) -> int:
+    """The process of a worker that is ready."""
+    assert worker.identity is not None
+    return worker.identity.pid
