@@ -1,0 +1,35 @@
+"""A run of stub workers in a process of its own: `python job.py ROOT` samples one book after another into its spool.
+
+It takes wishes and tells its status like any run, and ends after the book in which ROOT/enough appears.
+"""
+
+from __future__ import annotations
+
+import sys
+from contextlib import closing
+from itertools import count
+from pathlib import Path
+
+from house import House, policy
+
+from t6gps.service import seeding
+from t6gps.storage import catalog
+from t6gps.storage.spool import Spool
+
+CONFIG = {"run": {"episodes": 60, "steps": 250, "workers": 3}}
+
+
+def main(root: Path) -> None:
+    house = House(root, CONFIG)
+    with catalog.locked(house.run), closing(house.executor) as executor:
+        for iteration in count():
+            spool = Spool(house.run.spool, iteration)
+            for episode in executor.sample(seeding.training_plans(house.config, iteration), policy(iteration)):
+                spool.append(episode)
+            if (root / "enough").exists():
+                break
+        executor.finished = True
+
+
+if __name__ == "__main__":
+    main(Path(sys.argv[1]))

@@ -1,0 +1,209 @@
+"""Laws of a run on separate hosts: network namespaces with addresses of their own, a head and two nodes by `ray start`.
+
+The head stands in the middle: a pair of virtual Ethernet devices leads to each node, and it forwards between them. A
+host has its own /tmp/ray, as machines have. All addresses exist within the namespaces alone.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import secrets
+import signal
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+from house import QUICK_HEALTH_CHECKS, RUN, policy
+from job import CONFIG
+
+from t6gps.service import control, seeding
+from t6gps.service.config import Config
+from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
+from t6gps.storage.spool import Spool
+from t6gps.workers import stub
+
+ADDRESSES = {"head": "10.77.0.1", "near": "10.77.0.11", "far": "10.77.0.12"}
+PORT = 6379
+HERE = Path(__file__).parent
+OWN_TMP = 'mount --make-rprivate / && mount --bind "$0" /tmp/ray && exec "$@"'
+
+
+class Hosts:
+    """Namespaces by name, joined by links, and the processes that were started in them."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder, self.prefix = folder, f"t6gps-{os.getpid()}-"
+        self.token = secrets.token_hex(32)
+        self.processes: list[subprocess.Popen[bytes]] = []
+        for host in ADDRESSES:
+            (folder / host).mkdir()
+
+    def join(self) -> None:
+        """Make the namespaces and the links. CalledProcessError where that is not allowed."""
+        for host in ADDRESSES:
+            ip("netns", "add", self.prefix + host)
+            self.ip(host, "link set lo up")
+        self.ip("head", f"addr add {ADDRESSES['head']}/32 dev lo")
+        self.enter("head", ["sysctl", "-qw", "net.ipv4.ip_forward=1"]).wait()
+        for host in ("near", "far"):
+            self.ip("head", f"link add {host} type veth peer name out netns {self.prefix}{host}")
+            self.ip("head", f"link set {host} up")
+            self.ip("head", f"route add {ADDRESSES[host]}/32 dev {host} src {ADDRESSES['head']}")
+            self.ip(host, f"addr add {ADDRESSES[host]}/32 dev out")
+            self.restore(host)
+
+    def cut(self, host: str) -> None:
+        """The link to a host is dead."""
+        self.ip(host, "link set out down")
+
+    def restore(self, host: str) -> None:
+        """The link to a host works."""
+        self.ip(host, "link set out up")
+        self.ip(host, f"route add {ADDRESSES['head']}/32 dev out")
+        self.ip(host, f"route add default via {ADDRESSES['head']} dev out onlink")
+
+    def ip(self, host: str, command: str) -> None:
+        ip("-n", self.prefix + host, *command.split())
+
+    def enter(self, host: str, command: list[str], **environment: str) -> subprocess.Popen[bytes]:
+        """Start a command on a host; its output goes to a file of the host's folder."""
+        known = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
+        known |= {"RAY_AUTH_MODE": "token", "RAY_AUTH_TOKEN": self.token, "RAY_worker_niceness": "0"}
+        known |= QUICK_HEALTH_CHECKS
+        inside = ["unshare", "--mount", "sh", "-c", OWN_TMP, str(self.folder / host), *command]
+        with (self.folder / f"{host}-{len(self.processes)}.log").open("wb") as log:
+            started = subprocess.Popen(
+                ["ip", "netns", "exec", self.prefix + host, *inside],
+                stdout=log, stderr=subprocess.STDOUT, env=known | environment, start_new_session=True,
+            )  # fmt: skip
+        self.processes.append(started)
+        return started
+
+    def said(self, process: subprocess.Popen[bytes]) -> str:
+        """Everything that a process has written."""
+        (log,) = self.folder.glob(f"*-{self.processes.index(process)}.log")
+        return log.read_text()
+
+    def start_ray(self, host: str) -> subprocess.Popen[bytes]:
+        """A head or a node of one CPU, in the foreground: the process ends when the node does."""
+        ray = [str(Path(sys.executable).with_name("ray")), "start", "--block", "--disable-usage-stats", "--num-cpus=1"]
+        ray += [f"--node-ip-address={ADDRESSES[host]}", f"--object-store-memory={2 * 10**8}"]
+        head = ["--head", f"--port={PORT}", "--include-dashboard=false"]
+        return self.enter(host, [*ray, *(head if host == "head" else [f"--address={ADDRESSES['head']}:{PORT}"])])
+
+    def run(self, *command: str, **environment: str) -> subprocess.Popen[bytes]:
+        """A Python program on the head's host that joins the cluster."""
+        address = {"RAY_ADDRESS": f"{ADDRESSES['head']}:{PORT}"}
+        return self.enter("head", [sys.executable, *command], **(address | environment))
+
+    def close(self) -> None:
+        """End whatever runs on the hosts, and the hosts."""
+        for host in ADDRESSES:
+            name = self.prefix + host
+            pids = subprocess.run(["ip", "netns", "pids", name], check=False, capture_output=True).stdout.split()
+            for pid in pids:
+                with contextlib.suppress(ProcessLookupError):
+                    os.kill(int(pid), signal.SIGKILL)
+            subprocess.run(["ip", "netns", "del", name], check=False, capture_output=True)
+        for process in self.processes:
+            process.wait(20)
+
+
+def ip(*arguments: str) -> None:
+    """Run iproute2. CalledProcessError with its complaint."""
+    subprocess.run(["ip", *arguments], check=True, capture_output=True, timeout=20)
+
+
+@pytest.fixture(scope="module")
+def hosts(tmp_path_factory: pytest.TempPathFactory, wait_until: Callable[..., None]) -> Iterator[Hosts]:
+    found = Hosts(tmp_path_factory.mktemp("hosts"))
+    try:
+        try:
+            Path("/tmp/ray").mkdir(exist_ok=True)
+            found.join()
+        except (OSError, subprocess.CalledProcessError) as error:
+            said = getattr(error, "stderr", b"") or b""
+            pytest.skip(f"network namespaces cannot be made here (root and iproute2 needed): {error} {said.decode()}")
+        head = found.start_ray("head")
+        wait_until(lambda: "Ray runtime started" in found.said(head), 120)
+        yield found
+    finally:
+        found.close()
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    ("environment", "words"),
+    [
+        ({"RAY_AUTH_TOKEN": "0" * 64}, "token"),
+        ({"RAY_AUTH_MODE": "disabled", "RAY_AUTH_TOKEN": ""}, "token"),
+        ({"RAY_ADDRESS": f"{ADDRESSES['head']}:1"}, "no Ray answers at RAY_ADDRESS"),
+    ],
+    ids=["wrong token", "no token", "wrong address"],
+)
+def test_t19_who_has_no_token_or_a_wrong_address_is_told_so_in_one_error(
+    hosts: Hosts, tmp_path: Path, environment: dict[str, str], words: str
+) -> None:
+    command = ["-m", "t6gps.service.cli", "train", "flat-quick", "--root", str(tmp_path)]
+    refused = hosts.run(*command, **environment)
+    assert refused.wait(120) == 2
+    said = hosts.said(refused)
+    assert sum(line.startswith("error:") for line in said.splitlines()) == 1  # Ray's own warnings stand before it
+    assert words in said
+    assert "Traceback" not in said
+    assert hosts.token not in said
+
+
+@pytest.mark.slow
+def test_t16_a_run_goes_on_without_a_host_that_is_cut_off_and_with_it_when_it_is_back(
+    hosts: Hosts, tmp_path: Path, wait_until: Callable[..., None]
+) -> None:
+    nodes = {host: hosts.start_ray(host) for host in ("near", "far")}
+    job = hosts.run(str(HERE / "job.py"), str(tmp_path))
+    run = catalog.Run(tmp_path / RUN)
+
+    def status() -> dict[str, Any]:
+        assert job.poll() is None, hosts.said(job)
+        try:
+            return control.status(run)
+        except RunError:
+            return {"workers": [], "episodes": {"committed": 0}}
+
+    def at_work(host: str) -> bool:
+        return any(worker["episodes"] and worker["node"] == ADDRESSES[host] for worker in status()["workers"])
+
+    wait_until(lambda: all(at_work(host) for host in ADDRESSES), 240)
+    before = status()["episodes"]["committed"]
+    hosts.cut("near")
+    wait_until(lambda: not any(worker["node"] == ADDRESSES["near"] for worker in status()["workers"]), 120)
+    cut = status()["episodes"]["committed"]
+    wait_until(lambda: status()["episodes"]["committed"] > cut + 20, 60)
+    hosts.restore("near")
+
+    def back() -> bool:
+        if nodes["near"].poll() is not None:  # its node was given up; whoever looks after the host starts another
+            nodes["near"] = hosts.start_ray("near")
+        return at_work("near")
+
+    wait_until(back, 240)
+    (tmp_path / "enough").touch()
+    assert job.wait(120) == 0, hosts.said(job)
+    assert cut > before
+    config, found = Config.model_validate(CONFIG), control.status(run)
+    books = sorted(run.spool.iterdir())
+    assert found["state"] == "DONE"
+    assert found["episodes"]["committed"] == len(books) * config.run.episodes
+    assert found["episodes"]["failures"] == found["episodes"]["quarantined"] == 0
+    for iteration in range(len(books)):
+        episodes = Spool(run.spool, iteration).episodes()
+        plans = seeding.training_plans(config, iteration)
+        assert sorted(episodes) == [plan.episode_id for plan in plans]
+        for plan in plans:
+            alone = stub.episode(plan, policy(iteration))
+            assert episodes[plan.episode_id].frames.equals(alone.frames)
+            assert episodes[plan.episode_id].summary.equals(alone.summary)

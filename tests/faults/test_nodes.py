@@ -1,0 +1,135 @@
+"""Laws of a run on several nodes: three of Ray's on this machine, workers that obey orders, and a node that dies.
+
+Nodes join and go in the order of the tests; each leaves the run with three workers, ready.
+"""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+from collections.abc import Callable, Container, Iterator
+from pathlib import Path
+from typing import Any
+
+import pytest
+import ray
+from house import NODE, House, others, pid, three_nodes
+from ray.cluster_utils import Cluster
+
+from t6gps.service import cluster, control, deadlines
+from t6gps.service.slots import Worker
+from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
+from t6gps.storage.records import Episode
+
+CPUS_PER_WORKER = 0.6
+CONFIG = {"run": {"episodes": 45, "steps": 250, "workers": 3, "cpus_per_worker": CPUS_PER_WORKER}}
+
+
+@pytest.fixture(scope="module")
+def nodes() -> Iterator[Cluster]:
+    with three_nodes() as found:
+        yield found
+
+
+@pytest.fixture(scope="module")
+def everything(nodes: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    house = House(tmp_path_factory.mktemp("nodes"), CONFIG)
+    with catalog.locked(house.run):
+        try:
+            yield house
+        finally:
+            house.executor.close()
+
+
+@pytest.fixture
+def house(everything: House, wait_until: Callable[..., None]) -> House:
+    """Three workers, ready."""
+    wait_until(lambda: everything.ready(3), 120)
+    return everything
+
+
+def node_of(worker: Worker) -> str:
+    """The node of a worker that is ready, in Ray's words."""
+    name: str = worker.handle.node
+    return name
+
+
+def nodes_in_use(house: House) -> set[str]:
+    return {node_of(worker) for worker in house.workers}
+
+
+def until_busy(house: House, episodes: Iterator[Episode], names: Container[str]) -> tuple[list[Episode], Worker]:
+    """Episodes up to the moment in which a worker on one of these nodes has two plans; that worker."""
+    found = []
+    for episode in episodes:
+        found.append(episode)
+        for worker in house.workers:
+            if len(worker.plans) == 2 and node_of(worker) in names:
+                return found, worker
+    raise AssertionError("no worker there ever had two plans")
+
+
+def test_workers_are_spread_over_all_nodes_and_give_the_same_data(house: House) -> None:
+    assert nodes_in_use(house) == {node["NodeID"] for node in ray.nodes()}
+    house.check(list(house.sample()))
+    assert cluster.free_workers(CPUS_PER_WORKER) == 0  # 0.4 CPUs are left on each, and no worker fits on any
+    assert ray.available_resources()["CPU"] > CPUS_PER_WORKER
+
+
+@pytest.mark.parametrize("how", ["SIGSTOP", "hang-in-c"])
+def test_t2_a_worker_that_hangs_on_another_node_is_looked_into_and_ended_there(
+    house: House, nodes: Cluster, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None], how: str
+) -> None:
+    house.check(list(house.sample()))  # the deadlines are measured now
+    monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
+    episodes = house.sample()
+    found, victim = until_busy(house, episodes, others(nodes))
+    process = pid(victim)
+    if how == "SIGSTOP":
+        os.kill(process, signal.SIGSTOP)
+    else:
+        (house.orders / f"episode-{victim.plans[1].episode_id}").write_text("hang-in-c 1")
+    house.check(found + list(episodes))
+    ((failure,),) = house.executor.ledger.failures.values()
+    assert {"SIGSTOP": "(SIGSTOP)", "hang-in-c": "_hang_in_c"}[how] in failure.trace
+    assert failure.kind == {"SIGSTOP": "lost", "hang-in-c": "hang"}[how]
+    wait_until(lambda: not Path(f"/proc/{process}").exists(), 30)
+
+
+def test_a_node_that_joins_gets_workers_when_more_are_wished(house: House, nodes: Cluster) -> None:
+    answers: list[Any] = []
+
+    def scale() -> None:
+        try:
+            answers.append(control.scale(house.run, 4, 120)["ready"])
+        except RunError as error:  # told by the main thread
+            answers.append(error)
+
+    scaling, before, joined = threading.Thread(target=scale), nodes_in_use(house), False
+    scaling.start()
+    while scaling.is_alive():
+        house.check(list(house.sample()))
+        if not joined and "wait for a CPU" in house.executor.pool.reason:
+            nodes.add_node(**NODE)
+            joined = True
+    assert answers == [4]
+    assert len(nodes_in_use(house)) == len(before) + 1
+    house.check(list(house.sample()))
+    house.executor.pool.wanted = 3
+
+
+def test_t16_a_node_that_dies_takes_no_episode_with_it(
+    house: House, nodes: Cluster, wait_until: Callable[..., None]
+) -> None:
+    nodes.add_node(**NODE)  # there is room for a successor
+    failures_n, episodes = house.executor.ledger.counters["failures"], house.sample()
+    found, victim = until_busy(house, episodes, others(nodes))
+    slot, node = victim.slot, node_of(victim)
+    nodes.remove_node(others(nodes)[node], allow_graceful=False)
+    house.check(found + list(episodes))
+    assert house.executor.ledger.counters["failures"] == failures_n  # no episode is to blame
+    wait_until(lambda: house.ready(3) and node not in nodes_in_use(house), 120)
+    assert house.executor.pool.workers[slot].incarnation > victim.incarnation
+    house.check(list(house.sample()))
