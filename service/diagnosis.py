@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from itertools import pairwise
 from typing import Any
 
 Rows = Sequence[dict[str, Any]]
@@ -56,9 +55,18 @@ def diagnose(iterations: Rows, classes: Rows) -> list[str]:
     ]
 
 
+def _origins(ordered: Rows) -> dict[int, dict[str, Any]]:
+    """By iteration, the one that its policy was learned from: the one before it, or in a pipelined run before that."""
+    by_number = {row["iteration"]: row for row in ordered}
+    return {row["iteration"]: by_number[row["policy_version"] - 1] for row in ordered if row["policy_version"] > 0}
+
+
 def _step_too_large(ordered: Rows) -> str | None:
-    rises = []
-    for before, after in pairwise(ordered):
+    rises, origins = [], _origins(ordered)
+    for after in ordered:
+        before = origins.get(after["iteration"])
+        if before is None:
+            continue
         error = math.hypot(before["cost_standard_error"], after["cost_standard_error"])
         rise = after["cost"] - before["cost"]
         if rise > STANDARD_ERRORS * error:
@@ -75,15 +83,17 @@ def _step_too_large(ordered: Rows) -> str | None:
 
 
 def _promise_not_kept(ordered: Rows) -> str | None:
-    if len(ordered) < 3:
+    origins, end = _origins(ordered), ordered[-1]
+    middle = origins.get(end["iteration"])
+    start = middle and origins.get(middle["iteration"])
+    if middle is None or start is None:
         return None
-    start, end = ordered[-3], ordered[-1]
-    promised = sum(row["predicted_cost_change"] for row in ordered[-3:-1])
+    promised = start["predicted_cost_change"] + middle["predicted_cost_change"]
     realised = end["cost"] - start["cost"]
     if promised >= 0 or realised < 0:
         return None
     return (
-        f"Learning has stopped: over the last two iterations the cost went from {start['cost']:.3f} to "
+        f"Learning has stopped: over the last two steps the cost went from {start['cost']:.3f} to "
         f"{end['cost']:.3f} m2/s2, where the models promised {promised:.3f} in all; "
         "try more data (run.episodes), or more weight on the pooled models (learner.prior_samples)."
     )

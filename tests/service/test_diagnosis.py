@@ -18,7 +18,9 @@ COSTS = (1.0, 0.43, 0.42, 0.36)
 
 
 def iterations(costs: tuple[float, ...] = COSTS, **newest: Any) -> list[dict[str, Any]]:
-    rows = [HEALTHY | {"iteration": number, "cost": cost} for number, cost in enumerate(costs)]
+    rows = [
+        HEALTHY | {"iteration": number, "policy_version": number, "cost": cost} for number, cost in enumerate(costs)
+    ]
     rows[-1].update(newest)
     return rows
 
@@ -72,6 +74,17 @@ def test_the_settings_to_try_exist() -> None:
         for name in named:
             section, _, key = name.partition(".")
             assert key in known[section], name
+
+
+def test_a_pipelined_run_is_judged_by_what_each_policy_was_learned_from() -> None:
+    def pipelined(*costs: float) -> list[dict[str, Any]]:
+        return [row | {"policy_version": max(row["iteration"] - 1, 0)} for row in iterations(costs)]
+
+    assert diagnose(pipelined(1.0, 0.95, 0.4, 0.45), classes())[0].startswith("All well")  # two lines of descent
+    (sentence,) = diagnose(pipelined(1.0, 0.95, 0.4, 0.6, 0.5), classes())
+    assert "too large: after iteration 2 the cost rose from 0.400 to 0.500" in sentence
+    (sentence,) = diagnose(pipelined(0.5, 0.5, 0.49, 0.5, 0.505), classes())
+    assert "went from 0.500 to 0.505" in sentence and "-0.400" in sentence
 
 
 def test_one_mode_in_large_bins_is_no_lack_of_data() -> None:
