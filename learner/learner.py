@@ -42,7 +42,7 @@ SEGMENTED = (Localization.SEGMENTS, Localization.TIME)
 """Localizations that fit the models of segment classes; the others leave the table `classes` empty."""
 CHUNK = 256
 """Sub-trajectories solved at once: their matrices stay in the cache. Chunks do not depend on each other, so they run on
-all cores, which the workers leave idle while the learner works, with the same result."""
+all cores, which the workers leave idle while the learner works (but for a pipelined run), with the same result."""
 
 
 class Learner:
@@ -56,6 +56,7 @@ class Learner:
     world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
     fit_map                applies a pure function to jobs and returns the results in their order; `map` or a
                            pool
+    keeps_earlier          the policy before the newest is kept, too, for workers that act with it in a pipelined run
     """
 
     def __init__(
@@ -70,6 +71,7 @@ class Learner:
         scale_m: float,
         world_labels: NDArray[np.int64],
         fit_map: FitMap = map,
+        keeps_earlier: bool = False,
     ) -> None:
         self._settings = settings
         self._run_seed = run_seed
@@ -78,6 +80,7 @@ class Learner:
         self._command_range_m = command_range_m
         self._world_labels = world_labels
         self._fit_map = fit_map
+        self._keeps_earlier = keeps_earlier
         action_n = schema.vector_length(schema.FRAMES.field("action"))
         assert action_n is not None
         self.snapshot: PolicySnapshot = policy.initial(
@@ -88,6 +91,7 @@ class Learner:
             offset_m=offset_m,
             scale_m=scale_m,
         )
+        self._earlier: PolicySnapshot | None = None
         self._replayed: deque[Pairs] = deque(maxlen=settings.replay_iterations)
         self._episodes: dict[int, pa.Table] = {}
         self._segmented: Segmented | None = None
@@ -99,9 +103,15 @@ class Learner:
         branch = (LEARNER_STREAM, iteration, stream)
         return np.random.default_rng(np.random.SeedSequence(self._run_seed, spawn_key=branch))
 
-    def policy(self) -> PolicySnapshot:
-        """The policy that samples next."""
-        return self.snapshot
+    def policy(self, version: int | None = None) -> PolicySnapshot:
+        """The policy of a version, the newest by default. Raises RunError when it is not kept."""
+        for kept in (self.snapshot, self._earlier):
+            if kept is not None and version in (None, kept.version):
+                return kept
+        raise RunError(
+            f"policy version {version} is not kept, the learner has come to version {self.snapshot.version}; "
+            "only run.pipelined keeps the one before"
+        )
 
     def add(self, frames: pa.Table) -> None:
         """Take one episode of the iteration. Raises DataError when the learner already has it."""
@@ -194,7 +204,8 @@ class Learner:
         observations, actions = (np.concatenate(part) for part in zip(*self._replayed, pairs, strict=True))
         rng = self._rng(self.snapshot.version, SUPERVISED_STREAM)
         training = supervised.train(self.snapshot, observations, actions, self._settings, rng)
-        self.snapshot, loss = yield from training
+        newest, loss = yield from training
+        self._earlier, self.snapshot = self.snapshot if self._keeps_earlier else None, newest
         self._replayed.append(pairs)
         mean = np.clip(policy.act(self.snapshot, rows.observation), *self._command_range_m)
         if rows.labels is not None:
@@ -212,10 +223,10 @@ class Learner:
         return iteration, [number | row for row in classes]
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """What the next iteration depends on, between two iterations: policy and replayed pairs."""
-        arrays: dict[str, NDArray[Any]] = {}
-        for number, (weight, bias) in enumerate(self.snapshot.layers):
-            arrays[f"layer_{number}_weight"], arrays[f"layer_{number}_bias"] = weight, bias
+        """What the next iteration depends on, between two iterations: policies and replayed pairs."""
+        arrays = _arrays(self.snapshot, "layer")
+        if self._earlier is not None:
+            arrays |= _arrays(self._earlier, "earlier_layer")
         for number, (observations, actions) in enumerate(self._replayed):
             arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"] = observations, actions
         manifest = {
@@ -230,27 +241,42 @@ class Learner:
     def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
         """Continue from `state()`. Raises CheckpointError when entries are missing or the network has another shape."""
         try:
-            layers = tuple(
-                (arrays[f"layer_{number}_weight"], arrays[f"layer_{number}_bias"])
-                for number in range(manifest["layers"])
-            )
+            restored = _policy(manifest, arrays, "layer", manifest["version"])
+            earlier = None
+            if self._keeps_earlier and restored.version > 0:
+                earlier = _policy(manifest, arrays, "earlier_layer", restored.version - 1)
             replayed = [
                 (arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"])
                 for number in range(manifest["replays"])
             ]
-            restored = PolicySnapshot(manifest["version"], layers, manifest["offset_m"], manifest["scale_m"])
         except KeyError as error:
             raise CheckpointError(f"the learner's checkpoint lacks {error}; use an older checkpoint") from error
-        found = [weight.shape for weight, _ in layers]
+        found = [weight.shape for weight, _ in restored.layers]
         expected = [weight.shape for weight, _ in self.snapshot.layers]
         if found != expected:
             raise CheckpointError(
                 f"the checkpoint's policy has layers {found}, the settings ask for {expected}; "
                 "set hidden_layers as in the run that wrote it"
             )
-        self.snapshot = restored
+        self.snapshot, self._earlier = restored, earlier
         self._replayed = deque(replayed, maxlen=self._settings.replay_iterations)
         self._episodes.clear()
+
+
+def _arrays(snapshot: PolicySnapshot, name: str) -> dict[str, NDArray[Any]]:
+    """The layers of a policy under the names that a checkpoint has for them."""
+    arrays: dict[str, NDArray[Any]] = {}
+    for number, (weight, bias) in enumerate(snapshot.layers):
+        arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"] = weight, bias
+    return arrays
+
+
+def _policy(manifest: dict[str, Any], arrays: dict[str, NDArray[Any]], name: str, version: int) -> PolicySnapshot:
+    """The policy of which `_arrays` has made these layers. KeyError when one is missing."""
+    layers = tuple(
+        (arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"]) for number in range(manifest["layers"])
+    )
+    return PolicySnapshot(version, layers, manifest["offset_m"], manifest["scale_m"])
 
 
 def _of(result: Phase | None, phase: str) -> Phase:

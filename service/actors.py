@@ -64,7 +64,8 @@ def _get(reference: Any) -> Any:
 def _task_map(width: int) -> Callable[..., Iterator[Any]]:
     """A `map` that runs up to `width` calls at once as Ray tasks and yields their results in order.
 
-    The tasks claim no CPU: the workers, which hold the CPUs, are idle while the learner works.
+    The tasks claim no CPU: the workers hold the CPUs, and leave them idle while the learner works, or share them in
+    a pipelined run.
     """
 
     def task_map(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
@@ -102,15 +103,34 @@ class RayExecutor(Executor):
         )
         self._learner: Any = None
         self._newest: tuple[Episode, Any] | None = None  # an episode and the reference to its frames
+        self._keep: Callable[[Episode], None] | None = None  # while the workers sample ahead
         self._tended_s = -math.inf
         self._tend()
 
     def sample(
         self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
     ) -> Iterator[Episode]:
+        self._begin(plans, snapshot, purpose, None)
+        return self._arrivals()
+
+    def sample_ahead(
+        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
+    ) -> None:
+        self._begin(plans, snapshot, "episode", keep)
+
+    def _begin(
+        self,
+        plans: Sequence[EpisodePlan],
+        snapshot: PolicySnapshot,
+        purpose: str,
+        keep: Callable[[Episode], None] | None,
+    ) -> None:
         self._open(plans, snapshot, purpose)
         self._transport.publish(snapshot)
         self.pool.open({version: policy_digest(held) for version, held in self._snapshots.items()})
+        self._keep = keep
+
+    def _arrivals(self) -> Iterator[Episode]:
         for episode, frames in self.pool.arrivals():
             self._newest = episode, frames
             yield episode
@@ -179,7 +199,11 @@ class RayExecutor(Executor):
         self._tend()
 
     def _tend(self) -> None:
-        """Let the pool work, but not all the time."""
-        if time.monotonic() - self._tended_s >= control.TICK_S:
-            self.pool.tick()
-            self._tended_s = time.monotonic()
+        """Let the pool work, but not all the time, and keep what was sampled ahead."""
+        if time.monotonic() - self._tended_s < control.TICK_S:
+            return
+        self.pool.tick()
+        self._tended_s = time.monotonic()
+        if self._keep is not None:
+            for episode, _ in self.pool.arrived():
+                self._keep(episode)

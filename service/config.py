@@ -31,6 +31,7 @@ class RunSettings(Settings):
     workers_min: int = Field(1, ge=1, le=WORKERS_MOST_N, description="autoscaling: fewest workers")
     workers_max: int = Field(0, ge=0, le=WORKERS_MOST_N, description="autoscaling: most workers; 0 keeps `workers`")
     cpus_per_worker: float = Field(1.0, gt=0.0, le=64.0, description="CPUs that a worker claims; 0.5 puts two on one")
+    pipelined: bool = Field(False, description="sample while the learner works, with a policy one version older")
     evaluation_episodes: int = Field(40, ge=2, le=100000, description="noise-free episodes after the last iteration")
 
     @model_validator(mode="after")

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from t6gps.service import bundle
@@ -26,7 +26,7 @@ class Executor(ABC):
 
     run       whose folder keeps crash bundles and status; None where nothing is to be kept
     finished  set when the work is done: what is closed then is not stopped half-way
-    ledger    the episodes of the present call of `sample`, and the counters of the whole run
+    ledger    the episodes of the present call of `sample` or `sample_ahead`, and the counters of the whole run
     """
 
     def __init__(self, config: Config, run: Run | None = None) -> None:
@@ -40,10 +40,19 @@ class Executor(ABC):
     def sample(
         self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
     ) -> Iterator[Episode]:
-        """Run the plans with the policy; yields each episode when it is done, in any order.
+        """Begin to run the plans with the policy; yields each episode when it is done, in any order.
 
         Whoever asks for the next episode has made the last one durable. An episode that fails three times is left
         out and kept as a crash bundle named after `purpose`; RunError when nothing but failures comes back.
+        """
+
+    @abstractmethod
+    def sample_ahead(
+        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
+    ) -> None:
+        """Let the workers begin with plans while the learner works; `keep` makes each episode durable.
+
+        It ends with the next call of `sample`, which is given the plans that are still missing.
         """
 
     @abstractmethod

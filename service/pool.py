@@ -118,12 +118,16 @@ class Pool:
         while self._arrived or self.ledger.backlog:
             if not self._arrived:
                 self.tick(control.TICK_S)
-                continue
+            yield from self.arrived()
+        if self.ledger.hopeless:
+            self.tick()
+
+    def arrived(self) -> Iterator[tuple[Episode, Any]]:
+        """Those of them that are there, without waiting for others."""
+        while self._arrived:
             episode_id, episode, reference = self._arrived.popleft()
             yield episode, reference
             self.ledger.commit(episode_id)
-        if self.ledger.hopeless:
-            self.tick()
 
     def close(self, state: str, reason: str) -> None:
         """End every worker and say how the run ended."""

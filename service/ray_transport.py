@@ -159,7 +159,12 @@ class RayTransport(Transport):
         self.holders_n = 1
 
     def publish(self, snapshot: PolicySnapshot) -> None:
-        """Give the holder the newest policy, and keep it in case the holder dies. RunError for an older one."""
+        """Give the holder the newest policy, and keep it in case the holder dies.
+
+        Nothing is done for a policy that is held. RunError for one that is older than those.
+        """
+        if snapshot.version in self._held:
+            return
         newest = max(self._held, default=snapshot.version)
         if snapshot.version < newest:
             raise RunError(f"policy versions only grow: version {newest} is published, found {snapshot.version}")

@@ -4,6 +4,9 @@ What a crash leaves behind decides where to go on. Episodes are in the spool as 
 iteration's tables are committed once; the checkpoint comes last and the spool is emptied after it. So a resumed run
 takes the newest checkpoint, reads the spooled episodes of its iteration, samples the missing ones and learns again:
 each step depends on seeds alone, and committing an iteration a second time changes nothing.
+
+In a pipelined run the workers begin with an iteration while the learner is still at work on the one before it. What
+they have sampled is in the spool when the iteration's turn comes, which then goes on as a resumed one does.
 """
 
 from __future__ import annotations
@@ -11,6 +14,7 @@ from __future__ import annotations
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
+from dataclasses import dataclass
 from typing import Any, Protocol
 
 import numpy as np
@@ -22,7 +26,7 @@ from t6gps.service.executor import PHASES, Executor
 from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError
-from t6gps.storage.records import Episode
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import Spool
 
 PHASE_TITLES = {
@@ -83,36 +87,64 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
             executor.replace_learner()
 
 
+@dataclass(frozen=True)
+class Batch:
+    """The episodes of one iteration: planned, those in the spool by number, and the policy that acts in the others."""
+
+    plans: list[EpisodePlan]
+    episodes: dict[int, Episode]
+    snapshot: PolicySnapshot
+
+    @property
+    def missing(self) -> list[EpisodePlan]:
+        return [plan for plan in self.plans if plan.episode_id not in self.episodes]
+
+
+def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
+    plans = seeding.training_plans(config, spool.iteration)
+    snapshot = executor.ask("policy", plans[0].policy_version)
+    return Batch(plans, spool.episodes(), snapshot)
+
+
 def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
     durations: dict[str, float] = {}
-    spool = Spool(run.spool, iteration)
     with _timed(durations, "sample"):
-        episodes = spool.episodes()
-        for episode in episodes.values():
+        spool = Spool(run.spool, iteration)
+        batch = _batch(config, executor, spool)
+        plans, episodes = batch.plans, batch.episodes
+        arriving = executor.sample(batch.missing, batch.snapshot)
+        for episode in list(episodes.values()):
             executor.add(episode)
-        plans = seeding.training_plans(config, iteration)
-        missing = [plan for plan in plans if plan.episode_id not in episodes]
         observer.progress(iteration, "sample", len(episodes), len(plans))
-        for episode in executor.sample(missing, executor.ask("policy")):
+        for episode in arriving:
             spool.append(episode)
             executor.add(episode)
             episodes[episode.summary["episode_id"][0].as_py()] = episode
             observer.progress(iteration, "sample", len(episodes), len(plans))
     if not episodes:
         raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
+    if config.run.pipelined and iteration + 1 < config.run.iterations:
+        _sample_ahead(config, run, executor, iteration + 1)
     for phase in PHASES:
         with _timed(durations, phase):
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase, done, total)
     learned, classes = executor.ask("report")
     ordered = [episodes[plan.episode_id] for plan in plans if plan.episode_id in episodes]
-    row = {"iteration": iteration, "policy_version": iteration, **_sampled(ordered), **learned, **durations}
+    row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
+    row |= _sampled(ordered) | learned | durations
     row["left_out"] = len(plans) - len(ordered)
     tables.commit_iteration(run, iteration, ordered, row, classes)
     manifest, arrays = executor.ask("state")
     checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
     spool.clear()
     observer.finished(row)
+
+
+def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) -> None:
+    spool = Spool(run.spool, iteration)
+    batch = _batch(config, executor, spool)
+    executor.sample_ahead(batch.missing, batch.snapshot, spool.append)
 
 
 @contextmanager

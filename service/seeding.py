@@ -14,8 +14,13 @@ QUIET = 0.2
 
 
 def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
-    """Plans of an iteration; they depend on the configuration and the iteration alone."""
+    """Plans of an iteration; they depend on the configuration and the iteration alone.
+
+    The policy is the one that the iteration before has led to; in a pipelined run, whose learner is still at work on
+    that, the one before it.
+    """
     size = config.run.episodes
+    staleness = 1 if config.run.pipelined else 0
     return [
         _plan(
             config,
@@ -24,7 +29,7 @@ def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
             iteration=iteration,
             index=index,
             noise_std_m=_noise_std_m(config, iteration, index),
-            version=iteration,
+            version=max(iteration - staleness, 0),
         )
         for index in range(size)
     ]

@@ -50,6 +50,11 @@ class SerialExecutor(Executor):
             yield result
             self.ledger.commit(plan.episode_id)
 
+    def sample_ahead(
+        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
+    ) -> None:
+        """Nothing runs beside the learner here: all plans are left to `sample`."""
+
     def add(self, episode: Episode) -> None:
         self._learner.add(episode.frames)
 
@@ -78,5 +83,6 @@ def new_learner(config: Config, **options: Any) -> Learner:
         offset_m=nominal_rest_length(robot),
         scale_m=ACTION_SCALE_M,
         world_labels=CABLE_MAP,
+        keeps_earlier=config.run.pipelined,
         **options,
     )

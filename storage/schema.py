@@ -136,7 +136,7 @@ ITERATIONS = _schema(
     _scalar("fitting_s", pa.float64(), "s", "duration"),
     _scalar("backward_pass_s", pa.float64(), "s", "duration"),
     _scalar("supervised_s", pa.float64(), "s", "duration"),
-    _scalar("supervised_loss_before", pa.float64(), "1", "the same error of the policy that sampled", nullable=True),
+    _scalar("supervised_loss_before", pa.float64(), "1", "the same error before the supervised step", nullable=True),
     _POLICY_KL,
     _scalar(
         "saturated_share",

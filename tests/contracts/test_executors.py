@@ -17,6 +17,7 @@ from t6gps.service.config import Config, load
 from t6gps.service.executor import Executor
 from t6gps.service.serial import SerialExecutor
 from t6gps.storage import catalog, checkpoint, tables
+from t6gps.storage.catalog import Run
 from t6gps.workers import policy
 
 TINY = [
@@ -28,6 +29,8 @@ TINY = [
     "learner.hidden_layers=[16]",
 ]
 
+PIPELINED = [*TINY, "run.iterations=3", "run.pipelined=true"]
+
 
 class Silent:
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None: ...
@@ -36,19 +39,27 @@ class Silent:
 
 
 class Kills(Silent):
-    """Kills a worker in the second iteration's sampling, and the learner while it fits."""
+    """Kills a worker at some progress of the run, and the learner while it fits the second iteration."""
 
-    def __init__(self, executor: RayExecutor) -> None:
-        self.executor, self.done = executor, set[str]()
+    def __init__(self, executor: RayExecutor, worker_at: tuple[int, str, int]) -> None:
+        self.executor, self.worker_at, self.done = executor, worker_at, set[str]()
 
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
-        if (iteration, phase, done) == (1, "sample", 2) and "worker" not in self.done:
+        if (iteration, phase, done) == self.worker_at and "worker" not in self.done:
             self.done.add("worker")
             worker = next(worker for worker in self.executor.pool.workers.values() if worker.identity)
             os.kill(worker.identity.pid, signal.SIGKILL)
         if (iteration, phase) == (1, "fit") and "learner" not in self.done:
             self.done.add("learner")
             ray.kill(self.executor._learner)
+
+
+class Stops(Silent):
+    """Stops the run while the learner is at work on the second iteration."""
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        if (iteration, phase) == (1, "supervise"):
+            raise KeyboardInterrupt
 
 
 @pytest.fixture(autouse=True)
@@ -61,8 +72,12 @@ def result_of(
     config: Config, executor: Executor, root: Path, observer: run.Observer | None = None
 ) -> tuple[Any, Any, list[bytes]]:
     this = catalog.create(root, f"run-{type(executor).__name__}-{config.run.workers}", config.to_json())
+    return completed(config, executor, this, observer or Silent())
+
+
+def completed(config: Config, executor: Executor, this: Run, observer: run.Observer) -> tuple[Any, Any, list[bytes]]:
     try:
-        run.train(config, this, executor, observer or Silent())
+        run.train(config, this, executor, observer)
     finally:
         executor.close()
     latest = checkpoint.load_latest(this.checkpoints)
@@ -87,10 +102,39 @@ def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, 
 def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(tmp_path: Path, serial: Any) -> None:
     config = load("flat-quick", [*TINY, "run.workers=2"])
     executor = RayExecutor(config)
-    kills = Kills(executor)
+    kills = Kills(executor, (1, "sample", 2))
     assert result_of(config, executor, tmp_path, kills) == serial
     assert kills.done == {"worker", "learner"}
     assert executor.pool.counters["crashed"] == 1
+
+
+@pytest.fixture(scope="module")
+def pipelined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[bytes]]:
+    config = load("flat-quick", PIPELINED)
+    return result_of(config, SerialExecutor(config), tmp_path_factory.mktemp("pipelined"))
+
+
+@pytest.mark.slow
+def test_t10_t15_workers_that_sample_ahead_change_no_byte_nor_do_a_killed_one_and_a_killed_learner(
+    tmp_path: Path, pipelined: Any
+) -> None:
+    config = load("flat-quick", [*PIPELINED, "run.workers=2"])
+    executor = RayExecutor(config)
+    kills = Kills(executor, (0, "fit", 1))
+    assert result_of(config, executor, tmp_path, kills) == pipelined
+    assert kills.done == {"worker", "learner"}
+    assert executor.pool.counters["crashed"] == 1
+
+
+@pytest.mark.slow
+def test_t10_t15_a_run_that_is_stopped_while_it_samples_ahead_goes_on_with_the_same_bytes(
+    tmp_path: Path, pipelined: Any
+) -> None:
+    config = load("flat-quick", [*PIPELINED, "run.workers=2"])
+    this = catalog.create(tmp_path, "stopped", config.to_json())
+    with pytest.raises(KeyboardInterrupt):
+        completed(config, RayExecutor(config), this, Stops())
+    assert completed(config, RayExecutor(config), this, Silent()) == pipelined
 
 
 def test_the_policy_is_the_same_in_numpy_and_in_torch() -> None:

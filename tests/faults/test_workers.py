@@ -11,6 +11,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
+from dataclasses import replace
 from functools import partial
 from typing import Any
 
@@ -23,6 +24,7 @@ from t6gps.service import bundle, control, deadlines
 from t6gps.service.config import Config, parse
 from t6gps.service.ledger import FAILURES_ALLOWED_N
 from t6gps.service.sampler import policy_digest
+from t6gps.service.ray_transport import VERSIONS_HELD_N
 from t6gps.service.slots import Worker
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
@@ -232,7 +234,7 @@ def test_t9_the_holder_of_the_weights_dies_and_is_back_with_the_newest(
     wait_until(back, 30)
     assert ray.get(transport._holder.ping.remote()) == house.iteration
     with pytest.raises(RunError, match="versions only grow"):
-        transport.publish(policy(house.iteration - 1))
+        transport.publish(replace(policy(0), version=house.iteration - VERSIONS_HELD_N))
     house.check(list(house.sample()))
 
 
@@ -248,6 +250,23 @@ def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(ho
     assert most == 4
     assert bytes_ == 4 * found[0].frames.nbytes
     house.check(found + list(episodes))
+
+
+def test_what_workers_sample_ahead_is_kept_once_and_the_rest_is_left_to_the_next_call(
+    house: House, wait_until: Callable[..., None]
+) -> None:
+    house.iteration += 1
+    kept: list[Episode] = []
+    house.executor.sample_ahead(house.plans, policy(house.iteration), kept.append)
+
+    def tended() -> bool:
+        house.executor._tend()
+        return len(kept) >= 5
+
+    wait_until(tended, 30)
+    ahead = [episode.summary["episode_id"][0].as_py() for episode in kept]
+    missing = [plan for plan in house.plans if plan.episode_id not in ahead]
+    house.check(kept + list(house.executor.sample(missing, policy(house.iteration))))
 
 
 @pytest.mark.parametrize(

@@ -143,7 +143,7 @@ def make_frames() -> Callable[..., pa.Table]:
 
 @pytest.fixture
 def make_learner() -> Callable[..., Learner]:
-    def make(fit_map: Any = map, run_seed: int = 3, **settings: Any) -> Learner:
+    def make(fit_map: Any = map, run_seed: int = 3, keeps_earlier: bool = False, **settings: Any) -> Learner:
         small = {"hidden_layers": (16,), "epochs": 2, "smallest_class_segments": 10, "kl_weight": 0.02}
         return Learner(
             LearnerSettings(**small | settings),
@@ -155,6 +155,7 @@ def make_learner() -> Callable[..., Learner]:
             scale_m=SCALE_M,
             world_labels=np.tile(np.arange(24), (24, 1)),
             fit_map=fit_map,
+            keeps_earlier=keeps_earlier,
         )
 
     return make

@@ -108,6 +108,24 @@ def test_a_restored_learner_goes_on_with_identical_bytes(
     assert whole.report() == restored.report()
 
 
+def test_the_policy_before_the_newest_is_kept_where_it_is_asked_for_and_in_checkpoints(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner, forgetful = make_learner(keeps_earlier=True), make_learner()
+    untrained = learner.policy(0)
+    for one in (learner, forgetful):
+        iterate(one, tables[:8])
+    assert learner.policy() is learner.policy(1) and learner.policy(0) is untrained
+    assert weights(learner.policy()) == weights(forgetful.policy())
+    restored = make_learner(keeps_earlier=True)
+    restored.restore(*learner.state())
+    assert restored.policy(0).version == 0 and weights(restored.policy(0)) == weights(untrained)
+    with pytest.raises(RunError, match="version 0 is not kept"):
+        forgetful.policy(0)
+    with pytest.raises(CheckpointError, match="earlier_layer_0_weight"):
+        restored.restore(*forgetful.state())
+
+
 def test_a_checkpoint_that_does_not_fit_is_refused(make_learner: Callable[..., Learner]) -> None:
     manifest, arrays = make_learner().state()
     with pytest.raises(CheckpointError, match="hidden_layers"):

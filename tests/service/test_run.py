@@ -1,6 +1,6 @@
 """Laws of the training loop: a run that was stopped anywhere goes on as if it had not been."""
 
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -58,6 +58,16 @@ class StopsAfter(SerialExecutor):
         if phase == self._phase and self._learned == 2:
             raise KeyboardInterrupt
         return super().learn(phase)
+
+
+class SamplesAhead(StopsAfter):
+    """Has two episodes of the next iteration in the spool when the learner begins, as workers may have."""
+
+    def sample_ahead(
+        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
+    ) -> None:
+        for episode in self.sample(plans[:2], snapshot):
+            keep(episode)
 
 
 def trained(config: Config, this: Run, executor: SerialExecutor) -> Silent:
@@ -125,6 +135,40 @@ def test_a_crash_between_commit_and_checkpoint_changes_nothing(
     for found, expected in zip(kept(this), kept(uninterrupted), strict=True):
         assert found == expected
     assert tables.read(this, "iterations")["iteration"].to_pylist() == [0, 1, 2]
+
+
+@pytest.fixture(scope="module")
+def pipelined() -> Config:
+    return load("flat-quick", [*TINY, "run.pipelined=true"])
+
+
+@pytest.fixture(scope="module")
+def in_turn(pipelined: Config, tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A pipelined run in which nothing is sampled ahead."""
+    this = catalog.create(tmp_path_factory.mktemp("runs"), "in-turn", pipelined.to_json())
+    trained(pipelined, this, SerialExecutor(pipelined))
+    return this
+
+
+def test_a_pipelined_run_holds_the_version_that_acted_in_every_row(in_turn: Run) -> None:
+    for table in ("frames", "episodes", "iterations"):
+        rows = tables.read(in_turn, table, ["iteration", "policy_version"]).to_pylist()
+        assert {(row["iteration"], row["policy_version"]) for row in rows} == {(0, 0), (1, 0), (2, 1)}
+
+
+@pytest.mark.parametrize(
+    ("stop", "left"),
+    [({"episodes": 1}, 8), ({"episodes": 4}, 5), ({"phase": "segment"}, 1), ({"phase": "supervise"}, 1)],
+)
+def test_a_pipelined_run_resumes_bit_for_bit_and_samples_nothing_twice(
+    pipelined: Config, in_turn: Run, tmp_path: Path, stop: dict[str, Any], left: int
+) -> None:
+    this = catalog.create(tmp_path, "stopped", pipelined.to_json())
+    with pytest.raises(KeyboardInterrupt):
+        trained(pipelined, this, SamplesAhead(pipelined, **stop))
+    trained(pipelined, this, SamplesAhead(pipelined, episodes=left))
+    for found, expected in zip(kept(this), kept(in_turn), strict=True):
+        assert found == expected
 
 
 def test_spooled_episodes_are_not_sampled_again(config: Config, tmp_path: Path) -> None:

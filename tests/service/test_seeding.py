@@ -9,6 +9,13 @@ def test_plans_depend_on_configuration_and_iteration_alone() -> None:
     assert training_plans(a, 2) == training_plans(b, 2)
 
 
+def test_a_pipelined_run_samples_with_the_policy_before_the_newest() -> None:
+    for settings, versions in (([], [0, 1, 2, 3]), (["run.pipelined=true"], [0, 0, 1, 2])):
+        config = load("flat-quick", settings)
+        for iteration, version in enumerate(versions):
+            assert {plan.policy_version for plan in training_plans(config, iteration)} == {version}
+
+
 def test_no_two_episodes_share_a_seed_or_an_id() -> None:
     config = load("flat-quick")
     plans = [plan for iteration in range(5) for plan in training_plans(config, iteration)]
