@@ -78,6 +78,10 @@ class Ledger:
         """Episodes that came back and are not committed yet."""
         return len(self._arrived)
 
+    def lease_of(self, episode_id: int) -> Lease | None:
+        """The lease under which an episode came back that is not committed yet."""
+        return self._arrived.get(episode_id)
+
     @property
     def leases(self) -> Mapping[int, Lease]:
         """Leases by episode."""

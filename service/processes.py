@@ -75,6 +75,35 @@ def log_tail(folder: Path, pid: int) -> str:
     return text
 
 
+def descendants(pid: int) -> list[int]:
+    """Process ids of a process's children on this machine, of their children, and so on."""
+    parents = {}
+    for path in Path("/proc").glob("[0-9]*"):
+        with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
+            parents[int(path.name)] = int(_fields(int(path.name))[1])
+    found = [pid]
+    for parent in found:  # it grows
+        found += [child for child, whose in parents.items() if whose == parent]
+    return found[1:]
+
+
+def command(pid: int) -> str:
+    """The command line of a process, or the title that it gave itself; empty when it has ended."""
+    try:
+        return Path(f"/proc/{pid}/cmdline").read_bytes().replace(b"\0", b" ").decode(errors="replace").strip()
+    except (FileNotFoundError, ProcessLookupError):
+        return ""
+
+
+def cpu_s(pid: int) -> float:
+    """Processor time of a process (s), of all its threads and without its children; 0 when it has ended."""
+    try:
+        fields = _fields(pid)
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
 def fault_in(log: str) -> bool:
     """True when a process said in its log how it failed in C; Ray has every process do so."""
     return FAULT in log
@@ -91,5 +120,10 @@ def _state(process: Process) -> str:
 
 def _stat(pid: int) -> tuple[str, int]:
     """State letter and start time of a process. FileNotFoundError or ProcessLookupError when there is none."""
-    fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
+    fields = _fields(pid)
     return fields[0], int(fields[19])
+
+
+def _fields(pid: int) -> list[str]:
+    """What follows the name in /proc/PID/stat: state, parent, ..."""
+    return Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
