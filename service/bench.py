@@ -14,21 +14,32 @@ from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
     "learner": "t6gps.service.learning_benchmark",
+    "pool": "t6gps.service.pool_benchmark",
     "physics": "t6gps.workers.benchmarks",
     "soundness": "t6gps.workers.soundness",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
-def measure(name: str) -> dict[str, Any]:
-    """Run a benchmark: {"bench", "commit", "threads", "results": {key: number}}. ConfigError for an unknown name."""
+SIZED = ("pool",)
+"""Benchmarks that can be told how long and how often to measure."""
+
+
+def measure(name: str, **sizes: float) -> dict[str, Any]:
+    """Run a benchmark: {"bench", "commit", "threads", "notes", "results": {key: number, None where nothing is}}.
+
+    ConfigError for an unknown name, or for sizes of a benchmark that has none.
+    """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name, BENCHMARKS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
+    if sizes and name not in SIZED:
+        raise ConfigError(f"bench {name} has no --{' and no --'.join(sizes)}; allowed for: {', '.join(SIZED)}")
     module = importlib.import_module(BENCHMARKS[name])
-    run: Callable[[], dict[str, float]] = getattr(module, name)
-    return {"bench": name, "commit": commit(), "threads": getattr(module, "THREADS", 1), "results": run()}
+    run: Callable[..., dict[str, float | None]] = getattr(module, name)
+    known = {"threads": getattr(module, "THREADS", 1), "notes": list(getattr(module, "NOTES", ()))}
+    return {"bench": name, "commit": commit(), **known, "results": run(**sizes)}
 
 
 def commit() -> str:

@@ -275,16 +275,20 @@ def export(
 def bench(
     name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
     root: Root = DEFAULT_ROOT,
+    seconds: Annotated[float | None, typer.Option(help="pool: seconds of each measurement; 30 by default.")] = None,
+    rounds: Annotated[int | None, typer.Option(help="pool: measurements of each contender; 5 by default.")] = None,
     as_json: Json = False,
 ) -> None:
     """Measure speed, each figure beside a reference of the same run."""
-    result = benchmarks.measure(name)
+    sizes = {"seconds": seconds, "rounds": rounds}
+    result = benchmarks.measure(name, **{key: value for key, value in sizes.items() if value is not None})
     if as_json:
         typer.echo(json.dumps(result))
     else:
         rows = [{"key": key, "value": value} for key, value in result["results"].items()]
         title = f"{name} at commit {result['commit']}, {result['threads']} thread(s)"
         display.print_rows(title, rows, {"key": ("key", "{}"), "value": ("value", "{:.4g}")})
+        typer.echo("".join(f"{note}\n" for note in result["notes"]), nl=False)
 
 
 operate.add_to(app)
