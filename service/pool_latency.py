@@ -17,8 +17,8 @@ from pathlib import Path
 import numpy as np
 
 from t6gps.service import seeding
-from t6gps.service.pool import Worker
 from t6gps.service.pool_contenders import Job, opened
+from t6gps.service.slots import Worker
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.stub import StubWorker

@@ -91,7 +91,7 @@ def rllib(job: Job) -> Tally:
     import ray
     from ray.rllib.env.env_runner_group import EnvRunnerGroup
 
-    from t6gps.service.actors import join_or_start
+    from t6gps.service.cluster import join_or_start
     from t6gps.service.rllib_policy import runner_settings
 
     join_or_start(job.config)

@@ -21,13 +21,14 @@ import pyarrow as pa
 import ray
 
 from t6gps.service import seeding
-from t6gps.service.actors import RayTransport, Remote, join_or_start
+from t6gps.service.cluster import join_or_start
 from t6gps.service.config import Config
 from t6gps.service.control import Control
 from t6gps.service.ledger import Ledger
 from t6gps.service.pool import Pool
 from t6gps.service.pool_contenders import Job, Tally, steps_of
 from t6gps.service.processes import Process
+from t6gps.service.ray_transport import RayTransport, Remote
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.transport import Identity
 from t6gps.storage.records import Episode, EpisodePlan

@@ -134,7 +134,7 @@ def _how(error: Exception) -> str:
     return text
 
 
-class _Remote:
+class Remote:
     """A worker as the transport knows it: its actor, and its process once it is ready."""
 
     def __init__(self, actor: Any) -> None:
@@ -151,7 +151,7 @@ class RayTransport(Transport):
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
         self._node, self._logs = cluster.this_node(), _logs()
         self._caretakers: dict[str, Any] = {}
-        self._asked: dict[Any, tuple[_Remote, EpisodePlan | None, Any]] = {}
+        self._asked: dict[Any, tuple[Remote, EpisodePlan | None, Any]] = {}
         self._held: dict[int, PolicySnapshot] = {}
         self._holder = start_actor(HolderActor, where=self._node)
         self._holder_pong: Any = None
@@ -176,17 +176,17 @@ class RayTransport(Transport):
         except ray.exceptions.RayError:
             self._replace_holder()
 
-    def start(self, slot: int, incarnation: int) -> _Remote:
-        remote = _Remote(start_actor(WorkerActor, cpus=self._cpus))
+    def start(self, slot: int, incarnation: int) -> Remote:
+        remote = Remote(start_actor(WorkerActor, cpus=self._cpus))
         self._asked[remote.actor.open.remote(self._make_worker, self._settings)] = remote, None, "open"
         return remote
 
-    def send(self, handle: _Remote, plan: EpisodePlan) -> None:
+    def send(self, handle: Remote, plan: EpisodePlan) -> None:
         summary, frames, digest = handle.actor.run.options(num_returns=3).remote(plan, self._holder)
         # Of the three the frames alone travel: an answer counts as come when they are on this node.
         self._asked[frames] = handle, plan, (summary, digest)
 
-    def ping(self, handle: _Remote) -> None:
+    def ping(self, handle: Remote) -> None:
         self._asked[handle.actor.ping.remote()] = handle, None, "ping"
 
     def poll(self, wait_s: float) -> list[Report]:
@@ -199,7 +199,7 @@ class RayTransport(Transport):
             found, _ = ray.wait(list(self._asked), num_returns=len(self._asked), timeout=0)
         return [self._report(reference, *self._asked.pop(reference)) for reference in found]
 
-    def _report(self, reference: Any, remote: _Remote, plan: EpisodePlan | None, what: Any) -> Report:
+    def _report(self, reference: Any, remote: Remote, plan: EpisodePlan | None, what: Any) -> Report:
         try:
             answer = ray.get(reference)
             if plan is not None:
@@ -222,7 +222,7 @@ class RayTransport(Transport):
             self._caretakers[remote.node] = start_actor(CaretakerActor, where=remote.node)
         return Ready(remote, identity)
 
-    def examine(self, handle: _Remote) -> Remains:
+    def examine(self, handle: Remote) -> Remains:
         if handle.process is None:
             return Remains("the process was never ready")
         if handle.node == self._node:
@@ -241,7 +241,7 @@ class RayTransport(Transport):
                 del self._caretakers[node]  # the next worker that is ready there brings another
             return Remains(f"its node does not answer ({node}): {type(error).__name__}", blameless=True)
 
-    def kill(self, handle: _Remote) -> None:
+    def kill(self, handle: Remote) -> None:
         ray.kill(handle.actor)
         if handle.process is not None and handle.node == self._node:
             processes.kill(handle.process)  # a stopped process does not hear Ray
@@ -249,7 +249,7 @@ class RayTransport(Transport):
             self._caretakers[handle.node].kill.remote(handle.process)
         self._asked = {key: value for key, value in self._asked.items() if value[0] is not handle}
 
-    def placed(self, handle: _Remote) -> bool:
+    def placed(self, handle: Remote) -> bool:
         known = actors(handle.actor._actor_id.hex())
         return bool(known) and known["State"] not in ("DEPENDENCIES_UNREADY", "PENDING_CREATION")
 

@@ -23,11 +23,12 @@ from house import CONFIG, House, pid, policy
 from t6gps.service import bundle, control, deadlines
 from t6gps.service.config import Config, parse
 from t6gps.service.ledger import FAILURES_ALLOWED_N
-from t6gps.service.sampler import policy_digest
 from t6gps.service.ray_transport import VERSIONS_HELD_N
+from t6gps.service.sampler import policy_digest
 from t6gps.service.slots import Worker
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
+from t6gps.storage.records import Episode
 from t6gps.workers.stub import StubWorker
 
 AT_LENGTH = "T6GPS_SOAK_MINUTES" in os.environ
