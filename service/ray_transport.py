@@ -141,7 +141,8 @@ class Remote:
         self.actor = actor
         self.process: Process | None = None
         self.node = ""
-        self.died = self.exited = False  # and not by a signal, as Ray has seen
+        self.died = False
+        self.exited = False  # it died by leaving, as Ray has seen, or for want of memory
 
 
 class RayTransport(Transport):
@@ -232,14 +233,16 @@ class RayTransport(Transport):
         return replace(remains, blameless=remains.blameless and not handle.exited)
 
     def _examine_there(self, process: Process, node: str, died: bool) -> Remains:
-        try:
-            asked = self._caretakers[node].examine.remote(process, died)
-            remains: Remains = ray.get(asked, timeout=EXAMINE_DEADLINE_S)
-            return remains
-        except ray.exceptions.RayError as error:
-            if isinstance(error, ray.exceptions.ActorDiedError):
+        if node in self._caretakers:
+            try:
+                asked = self._caretakers[node].examine.remote(process, died)
+                remains: Remains = ray.get(asked, timeout=EXAMINE_DEADLINE_S)
+                return remains
+            except ray.exceptions.ActorDiedError:
                 del self._caretakers[node]  # the next worker that is ready there brings another
-            return Remains(f"its node does not answer ({node}): {type(error).__name__}", blameless=True)
+            except ray.exceptions.RayError as error:
+                _log.info("the caretaker of node %s does not answer: %s", node, type(error).__name__)
+        return Remains(f"its node does not answer ({node})", blameless=True)
 
     def kill(self, handle: Remote) -> None:
         ray.kill(handle.actor)

@@ -9,6 +9,8 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
+from house import others, three_nodes
+from ray.cluster_utils import Cluster
 
 from t6gps.learner import policy as torch_policy
 from t6gps.service import run
@@ -60,6 +62,21 @@ class Stops(Silent):
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
         if (iteration, phase) == (1, "supervise"):
             raise KeyboardInterrupt
+
+
+class Loses(Silent):
+    """Loses a node that has a worker in the second iteration's sampling."""
+
+    def __init__(self, executor: RayExecutor, nodes: Cluster) -> None:
+        self.executor, self.nodes, self.lost = executor, nodes, ""
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        if (iteration, phase) == (1, "sample") and not self.lost:
+            candidates = others(self.nodes)
+            used = [worker.handle.node for worker in self.executor.pool.workers.values()]
+            self.lost = next((node for node in used if node in candidates), "")
+            if self.lost:
+                self.nodes.remove_node(candidates[self.lost], allow_graceful=False)
 
 
 @pytest.fixture(autouse=True)
@@ -135,6 +152,16 @@ def test_t10_t15_a_run_that_is_stopped_while_it_samples_ahead_goes_on_with_the_s
     with pytest.raises(KeyboardInterrupt):
         completed(config, RayExecutor(config), this, Stops())
     assert completed(config, RayExecutor(config), this, Silent()) == pipelined
+
+
+@pytest.mark.slow
+def test_t15_t16_three_nodes_of_which_one_dies_change_no_byte(tmp_path: Path, serial: Any) -> None:
+    config = load("flat-quick", [*TINY, "run.workers=3"])
+    with three_nodes() as nodes:
+        executor = RayExecutor(config)
+        loses = Loses(executor, nodes)
+        assert result_of(config, executor, tmp_path, loses) == serial
+    assert loses.lost
 
 
 def test_the_policy_is_the_same_in_numpy_and_in_torch() -> None:

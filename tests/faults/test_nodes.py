@@ -14,7 +14,7 @@ from typing import Any
 
 import pytest
 import ray
-from house import NODE, House, others, pid, three_nodes
+from house import House, add_node, others, pid, three_nodes
 from ray.cluster_utils import Cluster
 
 from t6gps.service import cluster, control, deadlines
@@ -112,7 +112,7 @@ def test_a_node_that_joins_gets_workers_when_more_are_wished(house: House, nodes
     while scaling.is_alive():
         house.check(list(house.sample()))
         if not joined and "wait for a CPU" in house.executor.pool.reason:
-            nodes.add_node(**NODE)
+            add_node(nodes)
             joined = True
     assert answers == [4]
     assert len(nodes_in_use(house)) == len(before) + 1
@@ -123,7 +123,7 @@ def test_a_node_that_joins_gets_workers_when_more_are_wished(house: House, nodes
 def test_t16_a_node_that_dies_takes_no_episode_with_it(
     house: House, nodes: Cluster, wait_until: Callable[..., None]
 ) -> None:
-    nodes.add_node(**NODE)  # there is room for a successor
+    add_node(nodes)  # there is room for a successor
     failures_n, episodes = house.executor.ledger.counters["failures"], house.sample()
     found, victim = until_busy(house, episodes, others(nodes))
     slot, node = victim.slot, node_of(victim)
