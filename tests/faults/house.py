@@ -34,17 +34,19 @@ QUICK_HEALTH_CHECKS = {
 }
 """For a cluster's head: a node that dies or is cut off is noticed within seconds."""
 
+START_ATTEMPTS_N = 4
 NODE = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
 
 
 def add_node(nodes: Cluster) -> None:
     """Add a node of one CPU, the head first. Ray gives it half a minute to start, which is short on a busy machine."""
-    try:
-        nodes.add_node(**NODE)
-    except Exception as error:  # Ray has no narrower one
-        if "timed out during startup" not in str(error):
-            raise
-        nodes.add_node(**NODE)
+    for attempt in range(START_ATTEMPTS_N):
+        try:
+            nodes.add_node(**NODE)
+            return
+        except Exception as error:  # Ray has no narrower one
+            if "timed out during startup" not in str(error) or attempt == START_ATTEMPTS_N - 1:
+                raise
 
 
 @contextmanager
