@@ -14,8 +14,8 @@ from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
     "learner": "t6gps.service.learning_benchmark",
-    "pool": "t6gps.service.pool_benchmark",
     "physics": "t6gps.workers.benchmarks",
+    "pool": "t6gps.service.pool_benchmark",
     "soundness": "t6gps.workers.soundness",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
