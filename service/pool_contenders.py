@@ -148,11 +148,12 @@ def _processes(n: int, target: Any, *arguments: Any) -> Iterator[list[Connection
     """N fresh processes, each called with its end of a pipe and the arguments; they are killed at the end."""
     context = multiprocessing.get_context("spawn")
     pairs = [context.Pipe() for _ in range(n)]
-    started = [context.Process(target=target, args=(theirs, *arguments), daemon=True) for _, theirs in pairs]
+    started = []
     try:
-        for process in started:
-            process.start()
         for _, theirs in pairs:
+            process = context.Process(target=target, args=(theirs, *arguments), daemon=True)
+            process.start()
+            started.append(process)
             theirs.close()
         yield [ours for ours, _ in pairs]
     finally:
