@@ -104,7 +104,8 @@ def _peers() -> dict[str, Callable[[Job], Tally] | None]:
 
             found[f"efficiency_2_{name}"] = getattr(pool_peers, name)
         except ImportError as error:
-            console.print(f"{name} takes no part: {error}; pip install 't6gps[peers]'", highlight=False, soft_wrap=True)
+            words = f"{name} takes no part: {error}; pip install 't6gps[peers]'"
+            console.print(words, markup=False, highlight=False, soft_wrap=True)
     return found
 
 

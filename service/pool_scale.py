@@ -94,8 +94,7 @@ class SlotsTransport(RayTransport):
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
         assert isinstance(handle, _Slot)
-        summary, frames, digest = handle.actor.run.options(num_returns=3).remote(handle.number, plan)
-        self._asked[digest] = handle, plan, (summary, frames)
+        self._expect(handle, plan, handle.actor.run.options(num_returns=3).remote(handle.number, plan))
 
 
 def _no_worker(_: object) -> Any:

@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -183,8 +183,11 @@ class RayTransport(Transport):
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        summary, frames, digest = handle.actor.run.options(num_returns=3).remote(plan, self._holder)
-        # Of the three the frames alone travel: an answer counts as come when they are on this node.
+        self._expect(handle, plan, handle.actor.run.options(num_returns=3).remote(plan, self._holder))
+
+    def _expect(self, handle: Remote, plan: EpisodePlan, answer: Sequence[Any]) -> None:
+        """Of the three parts of an answer the frames alone travel: it counts as come when they are on this node."""
+        summary, frames, digest = answer
         self._asked[frames] = handle, plan, (summary, digest)
 
     def ping(self, handle: Remote) -> None:
