@@ -1,5 +1,5 @@
 /*
- * The LQG backward pass along sub-trajectories and the forward pass that predicts its gain, as learner/lqg.py states them.
+ * The LQG backward pass along sub-trajectories, and the forward pass that predicts its gain: what learner/lqg.py states.
  *
  * The matrices are small (39 states, 24 actions), so that calls of a general library cost more than the arithmetic; here
  * they stay in the first cache. Every sum has one order: the same bits on every processor.
@@ -17,24 +17,28 @@ typedef lanes unaligned __attribute__((aligned(sizeof(float))));
 
 #define BOTH_KINDS __attribute__((target_clones("avx2", "default"))) /* without FMA: the same bits */
 
-/* Row-major matrices whose rows have `width` lanes, filled up with zeros. */
+/* Row-major matrices whose rows have `width` lanes, filled up with zeros; `system` has [Quu -Qux -qu]. */
 struct work {
-    int nx, nu, nz, width;
-    lanes *F, *V, *VF, *Q, *gains, *next;
+    int nx, nu, nz, width, system_width, acting; /* acting: leading entries of x with a row of H that is not zero */
+    lanes *F, *V, *VF, *Q, *system, *next;
     float *v, *q;
 };
 
-/* C [rows, width] = A B, where a(i, k) = a[i * row + k * column] and B has `inner` rows. */
+static int lanes_of(int n) { return (n + LANES - 1) / LANES; }
+
+/*
+ * The first `width` lanes of C [rows, stride] = A B, where a(i, k) = a[i * row + k * column] and B is [inner, stride].
+ */
 BOTH_KINDS static void multiply(const float *a, int row, int column, int rows, int inner, const lanes *b, lanes *c,
-                                int width) {
+                                int width, int stride) {
     for (int i = 0; i < rows; i += 2) {
         const float *first = a + (size_t)i * row, *second = i + 1 < rows ? first + row : first;
-        lanes *to = c + (size_t)i * width, *also = i + 1 < rows ? to + width : to;
+        lanes *to = c + (size_t)i * stride, *also = i + 1 < rows ? to + stride : to;
         int at = 0;
         for (; at + 4 <= width; at += 4) {
             lanes s[8] = {{0}};
             const lanes *from = b + at;
-            for (int k = 0; k < inner; k++, from += width) {
+            for (int k = 0; k < inner; k++, from += stride) {
                 const float x = first[k * column], y = second[k * column];
                 for (int j = 0; j < 4; j++) {
                     s[j] += x * from[j];
@@ -46,8 +50,8 @@ BOTH_KINDS static void multiply(const float *a, int row, int column, int rows, i
         for (; at < width; at++) {
             lanes s = {0}, t = {0};
             for (int k = 0; k < inner; k++) {
-                s += first[k * column] * b[k * width + at];
-                t += second[k * column] * b[k * width + at];
+                s += first[k * column] * b[k * stride + at];
+                t += second[k * column] * b[k * stride + at];
             }
             to[at] = s, also[at] = t;
         }
@@ -64,33 +68,31 @@ BOTH_KINDS static float dot(const float *a, const float *b, int n) {
     return total;
 }
 
-/* row_i -= factor * row_k */
-static inline void subtract(lanes *to, float factor, const lanes *from, int width) {
-    for (int j = 0; j < width; j++) to[j] -= factor * from[j];
-}
-
 /*
- * Solves A X = B in place of B [n, width], by the Cholesky factors U'U of A, whose upper half lies in rows of `stride`
- * floats and is overwritten by U. Returns 0 if A is not positive definite.
+ * Solves A X = B, given in rows [A B] of `width` lanes, B from lane `first` on: X takes the place of B and the Cholesky
+ * factor U of A = U'U that of A's upper half. Returns 0 if A is not positive definite.
  */
-BOTH_KINDS static int solve(float *A, int stride, int n, lanes *B, int width) {
+BOTH_KINDS static int solve(lanes *system, int n, int first, int width) {
     for (int k = 0; k < n; k++) {
-        float *pivot = A + (size_t)k * stride;
-        if (!(pivot[k] > 0)) return 0;
-        const float scale = 1 / sqrtf(pivot[k]);
-        for (int j = k; j < n; j++) pivot[j] *= scale;
+        lanes *pivot = system + (size_t)k * width;
+        const float *U = (float *)pivot;
+        if (!(U[k] > 0)) return 0;
+        const float scale = 1 / sqrtf(U[k]);
+        for (int j = k / LANES; j < width; j++) pivot[j] *= scale;
         for (int i = k + 1; i < n; i++) {
-            float *row = A + (size_t)i * stride;
-            const float factor = pivot[i];
-            for (int j = i; j < n; j++) row[j] -= factor * pivot[j];
+            lanes *row = system + (size_t)i * width;
+            for (int j = i / LANES; j < width; j++) row[j] -= U[i] * pivot[j];
         }
-        for (int j = 0; j < width; j++) B[k * width + j] *= scale;
-        for (int i = k + 1; i < n; i++) subtract(B + (size_t)i * width, pivot[i], B + (size_t)k * width, width);
     }
     for (int k = n - 1; k >= 0; k--) {
-        const float scale = 1 / A[(size_t)k * stride + k];
-        for (int j = 0; j < width; j++) B[k * width + j] *= scale;
-        for (int i = 0; i < k; i++) subtract(B + (size_t)i * width, A[(size_t)i * stride + k], B + (size_t)k * width, width);
+        lanes *solved = system + (size_t)k * width;
+        const float scale = 1 / ((float *)solved)[k];
+        for (int j = first; j < width; j++) solved[j] *= scale;
+        for (int i = 0; i < k; i++) {
+            lanes *row = system + (size_t)i * width;
+            const float factor = ((float *)row)[k];
+            for (int j = first; j < width; j++) row[j] -= factor * solved[j];
+        }
     }
     return 1;
 }
@@ -103,10 +105,10 @@ struct problem {
     int length;
 };
 
-static int backward(const struct problem *p, const struct work *w) {
+BOTH_KINDS static int backward(const struct problem *p, const struct work *w) {
     const int nx = w->nx, nu = w->nu, nz = w->nz, width = w->width, stride = width * LANES;
-    const int narrow = (nx + LANES) / LANES; /* lanes of [Qux qu] */
-    float *V = (float *)w->V, *Q = (float *)w->Q, *F = (float *)w->F, *gains = (float *)w->gains;
+    const int first = lanes_of(nu), narrow = lanes_of(nx + 1), system_stride = w->system_width * LANES;
+    float *V = (float *)w->V, *Q = (float *)w->Q, *F = (float *)w->F;
     memset(V, 0, sizeof(float) * nx * stride);
     for (int i = 0; i < nx; i++) memcpy(V + i * stride, p->hessian + i * nx, sizeof(float) * nx);
     memcpy(w->v, p->gradient + (size_t)(p->length - 1) * nx, sizeof(float) * nx);
@@ -115,36 +117,42 @@ static int backward(const struct problem *p, const struct work *w) {
         const float *precision = p->precision + m * nu, *precision_P = p->precision_P + m * nu * nx;
         const float *deviation = p->deviation + (size_t)t * nu;
         for (int i = 0; i < nx; i++) memcpy(F + i * stride, p->F + (m * nx + i) * nz, sizeof(float) * nz);
-        multiply(V, stride, 1, nx, nx, w->F, w->VF, width);
-        multiply(F, 1, stride, nz, nx, w->VF, w->Q, width);
-        multiply(w->v, 0, 1, 1, nx, w->F, (lanes *)w->q, width);
-        float *Quu = Q + nx * stride + nx, *Qux = Q + nx * stride;
+        const int rank = t == p->length - 1 ? w->acting : nx; /* rows of V that are not zero */
+        multiply(V, stride, 1, rank, rank, w->F, w->VF, width, width);
+        multiply(F, 1, stride, nx, rank, w->VF, w->Q, lanes_of(nx), width); /* Qxx */
+        multiply(F + nx, 1, stride, nu, rank, w->VF, w->Q + nx * width, width, width); /* Qux Quu */
+        multiply(w->v, 0, 1, 1, nx, w->F, (lanes *)w->q, width, width);
+        float *Qux = Q + nx * stride;
         for (int i = 0; i < nu; i++) {
-            for (int j = 0; j < nx; j++) Qux[i * stride + j] -= precision_P[i * nx + j];
-            Quu[i * stride + i] += precision[i];
-            w->q[nx + i] += precision[i] * deviation[i];
-            memset(gains + i * narrow * LANES, 0, sizeof(float) * narrow * LANES);
-            for (int j = 0; j < nx; j++) gains[i * narrow * LANES + j] = -Qux[i * stride + j];
-            gains[i * narrow * LANES + nx] = -w->q[nx + i];
+            float *row = (float *)w->system + i * system_stride, *restrict gains = row + first * LANES;
+            float *restrict Qux_i = Qux + i * stride;
+            const float *restrict precision_P_i = precision_P + i * nx;
+            memcpy(row, Qux_i + nx, sizeof(float) * nu);
+            row[i] += precision[i];
+            for (int j = 0; j < nx; j++) gains[j] = -(Qux_i[j] -= precision_P_i[j]);
+            gains[nx] = -(w->q[nx + i] + precision[i] * deviation[i]);
         }
-        if (!solve(Quu, stride, nu, w->gains, narrow)) return 0;
+        if (!solve(w->system, nu, first, w->system_width)) return 0;
         for (int i = 0; i < nu; i++) {
-            memcpy(p->K + ((size_t)t * nu + i) * nx, gains + i * narrow * LANES, sizeof(float) * nx);
-            p->k[(size_t)t * nu + i] = gains[i * narrow * LANES + nx];
+            const float *gains = (float *)w->system + i * system_stride + first * LANES;
+            memcpy(p->K + ((size_t)t * nu + i) * nx, gains, sizeof(float) * nx);
+            p->k[(size_t)t * nu + i] = gains[nx];
         }
         if (t == 0) break;
-        multiply(Qux, 1, stride, nx, nu, w->gains, w->next, narrow); /* Qxu [K k] */
-        const float *next = (float *)w->next, *both = p->P_precision_P + m * nx * nx;
-        for (int i = 0; i < nx; i++)
-            for (int j = 0; j <= i; j++) {
-                const float one = Q[i * stride + j] + both[i * nx + j] + next[i * narrow * LANES + j];
-                const float other = Q[j * stride + i] + both[j * nx + i] + next[j * narrow * LANES + i];
-                V[i * stride + j] = V[j * stride + i] = (one + other) / 2 + p->hessian[i * nx + j];
-            }
-        for (int j = 0; j < nx; j++)
-            w->v[j] = w->q[j] + next[j * narrow * LANES + nx] + p->gradient[(size_t)(t - 1) * nx + j];
-        for (int i = 0; i < nu; i++)
-            for (int j = 0; j < nx; j++) w->v[j] -= deviation[i] * precision_P[i * nx + j];
+        multiply(Qux, 1, stride, nx, nu, w->system + first, w->next, narrow, w->system_width); /* Qxu [K k] */
+        const float *both = p->P_precision_P + m * nx * nx, *gradient = p->gradient + (size_t)(t - 1) * nx;
+        float *restrict v = w->v;
+        for (int i = 0; i < nx; i++) {
+            float *restrict V_i = V + i * stride;
+            const float *restrict Q_i = Q + i * stride, *restrict next = (float *)w->next + i * system_stride;
+            const float *restrict both_i = both + i * nx, *restrict hessian = p->hessian + i * nx;
+            for (int j = 0; j < nx; j++) V_i[j] = Q_i[j] + both_i[j] + next[j] + hessian[j];
+            v[i] = w->q[i] + next[nx] + gradient[i];
+        }
+        for (int i = 0; i < nu; i++) {
+            const float *restrict precision_P_i = precision_P + i * nx;
+            for (int j = 0; j < nx; j++) v[j] -= deviation[i] * precision_P_i[j];
+        }
     }
     return 1;
 }
@@ -162,7 +170,8 @@ static void forward(const struct problem *p, const struct work *w) {
         }
         for (int i = 0; i < nx; i++) dx[i] = dot(F + i * nz, dz, nz);
         float change = 0;
-        for (int i = 0; i < nx; i++) change += (gradient[i] + dot(p->hessian + i * nx, dx, nx) / 2) * dx[i];
+        for (int i = 0; i < nx; i++) change += gradient[i] * dx[i];
+        for (int i = 0; i < w->acting; i++) change += dot(p->hessian + i * nx, dx, w->acting) * dx[i] / 2;
         p->change[t] = change;
         memcpy(dz, dx, sizeof(float) * nx);
     }
@@ -213,15 +222,18 @@ static Py_ssize_t run(const Py_buffer *a, struct work *w) {
 
 static PyObject *solve_all(const Py_buffer *a) {
     const int nx = (int)a[GRADIENT].shape[2], nu = (int)a[DEVIATION].shape[2], nz = nx + nu;
-    const int width = (nz + LANES - 1) / LANES, narrow = (nx + LANES) / LANES;
-    struct work w = {.nx = nx, .nu = nu, .nz = nz, .width = width};
-    const size_t lanes_n = (size_t)(3 * nx + nz + 2) * width + (size_t)nz * narrow;
+    const int width = lanes_of(nz), system_width = lanes_of(nu) + lanes_of(nx + 1);
+    struct work w = {.nx = nx, .nu = nu, .nz = nz, .width = width, .system_width = system_width};
+    const float *hessian = a[HESSIAN].buf;
+    for (int i = 0; i < nx * nx; i++)
+        if (hessian[i] != 0 && w.acting <= i / nx) w.acting = i / nx + 1;
+    const size_t lanes_n = (size_t)(3 * nx + nz + 2) * width + (size_t)nz * system_width;
     lanes *memory = aligned_alloc(sizeof(lanes), lanes_n * sizeof(lanes));
     if (!memory) return PyErr_NoMemory();
     memset(memory, 0, lanes_n * sizeof(lanes));
     w.F = memory, w.V = w.F + nx * width, w.VF = w.V + nx * width, w.Q = w.VF + nx * width;
     w.v = (float *)(w.Q + nz * width), w.q = w.v + width * LANES;
-    w.gains = w.Q + (nz + 2) * width, w.next = w.gains + nu * narrow;
+    w.system = w.Q + (nz + 2) * width, w.next = w.system + nu * system_width;
     Py_ssize_t failed;
     Py_BEGIN_ALLOW_THREADS;
     failed = run(a, &w);
