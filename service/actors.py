@@ -22,6 +22,7 @@ from t6gps.service.executor import Executor
 from t6gps.service.pool import Pool
 from t6gps.service.ray_transport import MakeWorker, RayTransport
 from t6gps.service.sampler import policy_digest, settings_digest
+from t6gps.storage import ipc
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -36,8 +37,8 @@ class LearnerActor:
 
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
 
-    def add(self, frames: pa.Table) -> None:
-        self._learner.add(frames)
+    def add(self, frames: pa.Buffer) -> None:
+        self._learner.add(ipc.unpack(frames))
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         yield from getattr(self._learner, phase)()
@@ -137,10 +138,10 @@ class RayExecutor(Executor):
         self._newest = None
 
     def add(self, episode: Episode) -> None:
-        # The frames of an episode that has just been sampled are in the object store already.
-        frames = episode.frames
         if self._newest is not None and self._newest[0] is episode:
-            frames = self._newest[1]
+            frames = self._newest[1]  # just sampled: they are in the object store already
+        else:
+            frames = ipc.pack(episode.frames)
         self._answer(self._of_learner.add.remote(frames))
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:

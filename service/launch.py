@@ -70,12 +70,18 @@ def check_unchanged(this: Run, config: Config, remedy: str) -> None:
 def complete(config: Config, this: Run, serial: bool) -> tuple[Evaluation, list[Path]]:
     """Train what is missing of a run, evaluate its policy without noise, keep the result and draw the run's figures.
 
-    Returns the evaluation and the pictures. Everything sampled is kept when KeyboardInterrupt comes.
+    Returns the evaluation and the pictures. Everything sampled is kept when KeyboardInterrupt comes. A run is removed
+    whose first executor cannot start.
     """
     from t6gps.service import figures
 
     with catalog.locked(this):
-        with closing(start_executor(config, serial, this)) as executor:
+        try:
+            started = start_executor(config, serial, this)
+        except RunError:
+            catalog.discard_unused(this)
+            raise
+        with closing(started) as executor:
             with display.ProgressDisplay(config.run.iterations) as progress:
                 run.train(config, this, executor, progress)
             result = evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)

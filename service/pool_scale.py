@@ -31,6 +31,7 @@ from t6gps.service.processes import Process
 from t6gps.service.ray_transport import RayTransport, Remote
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.transport import Identity
+from t6gps.storage import ipc
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.storage.spool import Spool
 from t6gps.workers import stub
@@ -59,17 +60,17 @@ class SlotsActor:
     async def ping(self) -> None:
         """A sign of life."""
 
-    async def run(self, slot: int, plan: EpisodePlan) -> tuple[pa.Table, pa.Table, str]:
+    async def run(self, slot: int, plan: EpisodePlan) -> tuple[pa.Buffer, pa.Buffer, str]:
         """Sleep, then send the same numbers under the plan's number."""
         async with self._turns[slot]:
             await asyncio.sleep(EPISODE_S)
         return _renumbered(self._whole.summary, plan), _renumbered(self._whole.frames, plan), ""
 
 
-def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
+def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Buffer:
     column = table.schema.get_field_index("episode_id")
     field = table.schema.field(column)
-    return table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type))
+    return ipc.pack(table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type)))
 
 
 class _Slot(Remote):

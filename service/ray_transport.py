@@ -25,6 +25,7 @@ from t6gps.service.cluster import start_actor
 from t6gps.service.processes import Process
 from t6gps.service.sampler import Failure, Runner, attempt, policy_digest, settings_digest
 from t6gps.service.transport import Alive, Died, Done, Identity, Ready, Remains, Report, Transport
+from t6gps.storage import ipc
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.settings import RolloutSettings
@@ -79,7 +80,7 @@ class WorkerActor:
     def ping(self) -> None:
         """A sign of life."""
 
-    def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Table | Failure | None, pa.Table | None, str]:
+    def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Buffer | Failure | None, pa.Buffer | None, str]:
         """Summary, frames and the policy's digest; a Failure, or None without the policy, in the summary's place."""
         if self._worker is None:
             raise RunError("a worker must be opened before it runs plans")
@@ -94,7 +95,7 @@ class WorkerActor:
         result = attempt(self._worker, plan, self._snapshot)
         if isinstance(result, Failure):
             return result, None, self._digest
-        return result.summary, result.frames, self._digest
+        return ipc.pack(result.summary), ipc.pack(result.frames), self._digest
 
 
 class CaretakerActor:
@@ -208,8 +209,8 @@ class RayTransport(Transport):
             answer = ray.get(reference)
             if plan is not None:
                 result, digest = ray.get(list(what))
-                if isinstance(result, pa.Table):
-                    result = Episode(answer, result)
+                if isinstance(result, pa.Buffer):
+                    result = Episode(ipc.unpack(answer), ipc.unpack(result))
                 return Done(remote, plan, result, digest, reference)
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error

@@ -107,6 +107,13 @@ def create(root: Path, name: str, config_text: str) -> Run:
     return run
 
 
+def discard_unused(run: Run) -> None:
+    """Remove a run that is as it was created: no worker ever started for it, nothing was sampled."""
+    used = (run.tables, run.spool, run.checkpoints, run.figures)
+    if not run.pool.exists() and not any(any(folder.iterdir()) for folder in used):
+        durable.discard(run.path)
+
+
 def open_run(root: Path, name: str) -> Run:
     """The existing run `name` under `root`. Raises RunError naming the runs that exist, the closest first."""
     run = Run(root / check_name(name))

@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import numpy as np
 import pyarrow as pa
-import pyarrow.compute as pc
 from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
@@ -191,22 +190,22 @@ def check(table: pa.Table, schema: pa.Schema, where: str) -> pa.Table:
     """
     if table.schema.names != schema.names:
         raise DataError(f"{where}: columns must be {schema.names}, found {table.schema.names}")
-    for field in schema:
-        found, column = table.schema.field(field.name).type, table.column(field.name)
-        if found != field.type:
-            raise DataError(f"{where}: column {field.name} must be {field.type}, found {found}")
+    for field, column in zip(schema, table.columns, strict=True):
+        if column.type != field.type:
+            raise DataError(f"{where}: column {field.name} must be {field.type}, found {column.type}")
         if column.null_count and not field.nullable:
             raise DataError(f"{where}: column {field.name} must not be null, found {column.null_count} nulls")
-        length = vector_length(field)
-        if length is not None:
-            lengths = pc.list_value_length(column)
-            if not pc.all(pc.equal(lengths, length), min_count=0).as_py():
-                raise DataError(f"{where}: every entry of column {field.name} must hold {length} numbers")
-            column = pc.list_flatten(column)
-            if column.null_count:
-                raise DataError(f"{where}: column {field.name} holds nulls inside its vectors")
-        if pa.types.is_floating(column.type) and not pc.all(pc.is_finite(column), min_count=0).as_py():
-            raise DataError(f"{where}: column {field.name} holds numbers that are not finite")
+        length, floating = vector_length(field), pa.types.is_floating(column.type)
+        for chunk in column.chunks if floating or length is not None else ():
+            numbers = chunk.drop_null() if chunk.null_count else chunk
+            if length is not None:
+                if (np.diff(numbers.offsets.to_numpy()) != length).any():
+                    raise DataError(f"{where}: every entry of column {field.name} must hold {length} numbers")
+                numbers = numbers.flatten()
+                if numbers.null_count:
+                    raise DataError(f"{where}: column {field.name} holds nulls inside its vectors")
+            if not np.isfinite(numbers.to_numpy()).all():
+                raise DataError(f"{where}: column {field.name} holds numbers that are not finite")
     return table
 
 

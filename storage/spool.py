@@ -12,7 +12,7 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.compute as pc
 
-from t6gps.storage import durable, schema
+from t6gps.storage import durable, ipc, schema
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode
 
@@ -63,8 +63,7 @@ class Spool:
         path = self._folder / f"episode-{episode.summary.column('episode_id')[0].as_py():012d}.arrow"
         with durable.hidden(path).open("wb") as file:
             for table in (episode.frames, episode.summary):
-                with pa.ipc.new_stream(file, table.schema) as stream:
-                    stream.write_table(table)
+                file.write(ipc.pack(table))
         durable.publish(path)
 
     def episodes(self) -> dict[int, Episode]:

@@ -7,7 +7,6 @@ from pathlib import Path
 import numpy as np
 
 from t6gps.workers.settings import TerrainSettings
-from t6gps.workers.surface import load
 from t6gps.workers.terrain import Terrain, generate
 
 FENCE_HEIGHT_M = 2.0
@@ -17,6 +16,8 @@ FENCE_HEIGHT_M = 2.0
 def ground(settings: TerrainSettings, seed: int, difficulty: float) -> Terrain | None:
     """Ground of an episode, None for the endless plane. Raises TerrainError as `generate` and `surface.load`."""
     if settings.file:
+        from t6gps.workers.surface import load  # trimesh takes most of a second to load
+
         terrain = load(Path(settings.file), settings.size_m, settings.png_range_m)
     elif difficulty > 0 or settings.tilt_deg > 0:
         terrain = generate(seed, difficulty, settings.size_m)

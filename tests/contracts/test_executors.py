@@ -115,16 +115,6 @@ def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, 
     assert result_of(config, RayExecutor(config), tmp_path) == serial
 
 
-@pytest.mark.slow
-def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(tmp_path: Path, serial: Any) -> None:
-    config = load("flat-quick", [*TINY, "run.workers=2"])
-    executor = RayExecutor(config)
-    kills = Kills(executor, (1, "sample", 2))
-    assert result_of(config, executor, tmp_path, kills) == serial
-    assert kills.done == {"worker", "learner"}
-    assert executor.pool.counters["crashed"] == 1
-
-
 @pytest.fixture(scope="module")
 def pipelined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[bytes]]:
     config = load("flat-quick", PIPELINED)
@@ -132,13 +122,22 @@ def pipelined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[
 
 
 @pytest.mark.slow
-def test_t10_t15_workers_that_sample_ahead_change_no_byte_nor_do_a_killed_one_and_a_killed_learner(
-    tmp_path: Path, pipelined: Any
+@pytest.mark.parametrize(
+    ("settings", "expected", "worker_at"),
+    [(TINY, "serial", (1, "sample", 2)), (PIPELINED, "pipelined", (0, "fit", 1))],
+    ids=["ordinary", "sampling-ahead"],
+)
+def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
+    tmp_path: Path,
+    request: pytest.FixtureRequest,
+    settings: list[str],
+    expected: str,
+    worker_at: tuple[int, str, int],
 ) -> None:
-    config = load("flat-quick", [*PIPELINED, "run.workers=2"])
+    config = load("flat-quick", [*settings, "run.workers=2"])
     executor = RayExecutor(config)
-    kills = Kills(executor, (0, "fit", 1))
-    assert result_of(config, executor, tmp_path, kills) == pipelined
+    kills = Kills(executor, worker_at)
+    assert result_of(config, executor, tmp_path, kills) == request.getfixturevalue(expected)
     assert kills.done == {"worker", "learner"}
     assert executor.pool.counters["crashed"] == 1
 

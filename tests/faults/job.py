@@ -1,6 +1,7 @@
 """A run of stub workers in a process of its own: `python job.py ROOT` samples one book after another into its spool.
 
-It takes wishes and tells its status like any run, and ends after the book in which ROOT/enough appears.
+It begins with one worker and gets one on every host that joins (autoscaling), tells its status like any run, and ends
+after the book in which ROOT/enough appears.
 """
 
 from __future__ import annotations
@@ -16,7 +17,7 @@ from t6gps.service import seeding
 from t6gps.storage import catalog
 from t6gps.storage.spool import Spool
 
-CONFIG = {"run": {"episodes": 60, "steps": 250, "workers": 3}}
+CONFIG = {"run": {"episodes": 60, "steps": 250, "workers": 1, "workers_min": 1, "workers_max": 3}}
 
 
 def main(root: Path) -> None:

@@ -163,6 +163,7 @@ def test_t19_who_has_no_token_or_a_wrong_address_is_told_so_in_one_error(
     assert words in said
     assert "Traceback" not in said
     assert hosts.token not in said
+    assert list(tmp_path.iterdir()) == []
 
 
 @pytest.mark.slow

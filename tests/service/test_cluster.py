@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 import socket
+from pathlib import Path
 
 import pytest
 import ray
 
-from t6gps.service import cluster
+from t6gps.service import cluster, launch
 from t6gps.service.config import Config
+from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 
 
@@ -26,3 +28,13 @@ def test_an_address_at_which_nobody_listens_is_refused_at_once(monkeypatch: pyte
     with pytest.raises(RunError, match=f"no Ray answers at RAY_ADDRESS=127.0.0.1:{port}"):
         cluster.join_or_start(Config())
     assert not ray.is_initialized()
+
+
+def test_a_run_whose_cluster_is_not_there_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head")
+    this = catalog.create(tmp_path, "one", Config().to_json())
+    with pytest.raises(RunError, match="RAY_ADDRESS"):
+        launch.complete(Config(), this, serial=False)
+    assert list(tmp_path.iterdir()) == []

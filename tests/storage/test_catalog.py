@@ -31,6 +31,16 @@ def test_an_existing_run_is_refused_and_left_as_it_was(tmp_path: Path) -> None:
     assert run.config_path.read_text() == "first"
 
 
+def test_only_a_run_that_is_as_it_was_created_is_discarded(tmp_path: Path) -> None:
+    runs = [catalog.create(tmp_path, name, "{}") for name in ("new", "started", "sampled")]
+    runs[1].pool.mkdir()
+    (runs[2].spool / "episodes").touch()
+    for run in runs:
+        with catalog.locked(run):
+            catalog.discard_unused(run)
+    assert [path.name for path in sorted(tmp_path.iterdir())] == ["sampled", "started"]
+
+
 def test_a_root_that_is_a_file_or_lies_below_one_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("mine")
