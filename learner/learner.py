@@ -40,6 +40,8 @@ LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM = 1, 1, 2
 """Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy)."""
 SEGMENTED = (Localization.SEGMENTS, Localization.TIME)
 """Localizations that fit the models of segment classes; the others leave the table `classes` empty."""
+SEEN_N = {"sensors": schema.SENSORS_N, "shape": schema.OBSERVATION_N}
+"""Entries of an observation that the policy sees."""
 CHUNK = 256
 """Sub-trajectories solved at once: their matrices stay in the cache. Chunks do not depend on each other, so they run on
 all cores, which the workers leave idle while the learner works (but for a pipelined run), with the same result."""
@@ -84,7 +86,7 @@ class Learner:
         action_n = schema.vector_length(schema.FRAMES.field("action"))
         assert action_n is not None
         self.snapshot: PolicySnapshot = policy.initial(
-            schema.OBSERVATION_N,
+            SEEN_N[settings.observation],
             action_n,
             settings.hidden_layers,
             self._rng(0, INITIAL_STREAM),
@@ -200,14 +202,15 @@ class Learner:
         """Train the policy on this iteration's pairs and the replayed ones (line 13)."""
         rows, improved = _of(self._segmented, "segment").rows, _of(self._improved, "backward_pass")
         learned = improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
-        pairs = rows.observation[rows.continues], learned[rows.continues]
+        seen = rows.observation[:, : SEEN_N[self._settings.observation]]
+        pairs = seen[rows.continues], learned[rows.continues]
         observations, actions = (np.concatenate(part) for part in zip(*self._replayed, pairs, strict=True))
         rng = self._rng(self.snapshot.version, SUPERVISED_STREAM)
         training = supervised.train(self.snapshot, observations, actions, self._settings, rng)
         newest, loss = yield from training
         self._earlier, self.snapshot = self.snapshot if self._keeps_earlier else None, newest
         self._replayed.append(pairs)
-        mean = np.clip(policy.act(self.snapshot, rows.observation), *self._command_range_m)
+        mean = np.clip(policy.act(self.snapshot, seen), *self._command_range_m)
         if rows.labels is not None:
             mean = standard_gps.to_world(mean, rows.labels)
         self._trained = Trained(loss, mean)

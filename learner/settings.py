@@ -30,6 +30,7 @@ class ModeSearch(StrEnum):
     GAUSSIAN = "gaussian"
 
 
+Observation = Literal["sensors", "shape"]
 ReducedState = Literal["com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables"]
 LayerWidth = Annotated[int, Field(ge=1, le=4096)]
 
@@ -50,6 +51,9 @@ class LearnerSettings(Settings):
     kl_weight: float = Field(0.05, gt=0.0, le=100.0, description="weight of the KL term, c (m2/s2)")
     deviation_from: Literal["recorded", "fitted"] = Field(
         "recorded", description="the KL term is centred on the recorded policy mean or on the fitted p(x)"
+    )
+    observation: Observation = Field(
+        "shape", description="what the policy sees: the sensors of the paper (Sec. IV-C), or the nodes as well"
     )
     hidden_layers: tuple[LayerWidth, ...] = Field(
         (128, 128, 128), strict=False, min_length=1, max_length=8, description="tanh units per hidden layer"

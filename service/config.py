@@ -141,6 +141,8 @@ def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") 
         values = json.loads(text)
     except json.JSONDecodeError as error:
         raise ConfigError(f"{where} is not JSON: {error}; restore the file from a backup") from None
+    if isinstance(values, dict) and isinstance(values.get("learner"), dict):
+        values["learner"].setdefault("observation", "sensors")  # runs of before there was a choice
     config = _validated(_overridden(values, overrides), where)
     return _checked_world(config) if overrides else config
 

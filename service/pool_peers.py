@@ -61,7 +61,7 @@ def _scale(robot: RobotSettings) -> tuple[float, float]:
 
 
 class Actor:
-    """The job's policy, from observations [n, 47] to actions [n, 24] of the environment."""
+    """The job's policy, from observations [n, 83] to actions [n, 24] of the environment."""
 
     def __init__(self, job: Job) -> None:
         self._middle_m, self._half_range_m = _scale(job.config.robot)

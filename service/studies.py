@@ -69,8 +69,9 @@ PAPER = ("run.episodes=300", "run.steps=250", "run.iterations=5")
 PAPER_SEEDS = 3
 PAPER_COST = ("task.target_speed_m_per_s=0.8", "learner.kl_weight=0.02")
 PAPER_NETWORK = ("learner.hidden_layers=[256, 256, 256]",)
-AS_IN_THE_PAPER = (*PAPER_COST, *PAPER_NETWORK, "exploration.quiet_share=0")
-"""Cost, network and exploration of the paper (Sec. IV-A, IV-C), under which its claims are checked.
+PAPER_OBSERVATION = ("learner.observation=sensors",)
+AS_IN_THE_PAPER = (*PAPER_COST, *PAPER_NETWORK, *PAPER_OBSERVATION, "exploration.quiet_share=0")
+"""Cost, network, observation and exploration of the paper (Sec. IV-A, IV-C), under which its claims are checked.
 
 The KL term weighs as much beside the gradient of the cost as it does by default.
 """
@@ -120,12 +121,12 @@ LOCALIZATIONS = {
 BEYOND = {
     "default": ("v* = 2 m/s", ()),
     "v08": ("v* = 0.8 m/s", PAPER_COST),
-    "v12": ("v* = 1.2 m/s", ("task.target_speed_m_per_s=1.2", "learner.kl_weight=0.03")),
     "v40": ("v* = 4 m/s", ("task.target_speed_m_per_s=4", "learner.kl_weight=0.1")),
     "256-units": ("256 units", PAPER_NETWORK),
+    "sensors": ("sensors alone", PAPER_OBSERVATION),
     "quiet": ("a quarter quiet", ("exploration.quiet_share=0.25",)),
 }
-"""The default; other target speeds of the cost, the paper's own with its network; episodes with less noise."""
+"""The default; other target speeds of the cost; the paper's network; its observation; episodes with less noise."""
 
 CHANGED_WORLDS = {
     "flat": ("terrain.difficulty=0",),
@@ -214,7 +215,10 @@ STUDIES = {
         quick_seeds=2,
     ),
     "beyond": Study(
-        question="What do target speeds of the cost, a smaller network than the paper's and quiet episodes change?",
+        question=(
+            "What do target speeds of the cost, a smaller network than the paper's, an observation of the shape and "
+            "quiet episodes change?"
+        ),
         arms={
             f"{name}-{ground}": Arm(label, f"{ground} ground", preset, overrides)
             for ground, preset in (("flat", "flat"), ("rough", "rough-quick"))

@@ -14,11 +14,12 @@ from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
 
-SCHEMA_VERSION = 3
+SCHEMA_VERSION = 4
 """Grows with every change. Versions 2 and 3 added columns at the end of `iterations`, version 2 of `classes`; they are
-nullable, since older runs have none."""
-OBSERVATION_N = 47
-"""Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction."""
+nullable, since older runs have none. Version 4 added the nodes to `observation`."""
+SENSORS_N, SHAPE_N = 47, 36
+OBSERVATION_N = SENSORS_N + SHAPE_N
+"""Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
 
 
 def _scalar(name: str, kind: pa.DataType, unit: str, text: str, nullable: bool = False) -> pa.Field:
@@ -67,7 +68,7 @@ FRAMES = _schema(
     _vector("com_velocity", 3, "m/s", "canonical centre of mass velocity"),
     _vector("target_direction", 2, "1", "canonical horizontal unit vector to the active waypoint"),
     _vector("rest_lengths", 24, "m", "canonical cable rest lengths"),
-    _vector("observation", OBSERVATION_N, "1", "what the policy sees, scaled to order one"),
+    _vector("observation", OBSERVATION_N, "1", "what a policy may see: sensors, then nodes; scaled to order one"),
     _vector("action", 24, "m", "canonical commanded rest lengths, noise included", nullable=True),
     _vector("action_mean", 24, "m", "canonical commanded rest lengths of the noise-free policy", nullable=True),
     _vector("bar_positions", 18, "m", "bar centres [6, 3]"),

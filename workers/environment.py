@@ -21,9 +21,9 @@ except ModuleNotFoundError as error:
     ) from None
 
 from t6gps.storage.errors import DataError, UnsoundStateError
-from t6gps.storage.schema import OBSERVATION_N
+from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
 from t6gps.workers.episode import RunningEpisode
-from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, REST_LENGTH_SCALE_M
+from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE, REST_LENGTH_SCALE_M
 from t6gps.workers.physics import FASTEST_SOUND_M_PER_S, Simulation, nominal_rest_length
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 from t6gps.workers.start import check_stance
@@ -39,7 +39,7 @@ EPISODE_STEPS = 250
 
 
 def _observation_space(robot: RobotSettings) -> gymnasium.spaces.Box[np.float32]:
-    """The box [47] that no observation leaves; entries and scales are those of `observation`.
+    """The box [83] that no observation leaves; entries and scales are those of `observation`.
 
     Winches stay within the range of commands. A sound state bounds the root of the summed squares of all velocities,
     so also the angular velocity of each bar.
@@ -51,14 +51,15 @@ def _observation_space(robot: RobotSettings) -> gymnasium.spaces.Box[np.float32]
     low[1:25] = (robot.shortest_command_m - nominal_m) / REST_LENGTH_SCALE_M
     high[1:25] = (robot.longest_command_m - nominal_m) / REST_LENGTH_SCALE_M
     high[25:43] = FASTEST_SOUND_M_PER_S / (BAR_LENGTH_M / 2) / ANGULAR_VELOCITY_SCALE_RAD_PER_S
-    low[25:43] = -high[25:43]
+    high[SENSORS_N:] = FARTHEST_NODE
+    low[25:] = -high[25:]
     return gymnasium.spaces.Box(low.astype(np.float32), high.astype(np.float32))
 
 
 class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
     """SUPERball v2 on its way along random waypoints (paper Sec. IV-A), one control step of 0.1 s per `step`.
 
-    Observations [47] and actions [24] are canonical: as the policy of T6-GPS sees and commands them. Actions -1 and 1
+    Observations [83] and actions [24] are canonical: as the policy of T6-GPS sees and commands them. Actions -1 and 1
     stand for the shortest and longest commanded rest length. The reward is minus the running cost of the state
     reached (m2/s2).
     """

@@ -25,7 +25,7 @@ class RunningEpisode:
 
     state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
     waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
-    observation               what the policy sees now [47], with the noise of the sensors if they have any
+    observation               what a policy may see now [83], with the noise of the sensors if they have any
     course                    progress along the waypoints
     noise_rng                 the stream for exploration; start and course have streams of their own
 

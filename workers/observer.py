@@ -11,7 +11,13 @@ from numpy.typing import NDArray
 
 from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers import _observer
-from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, REST_LENGTH_SCALE_M, SLOWEST_TRACK_M_PER_S
+from t6gps.workers.observation import (
+    ANGULAR_VELOCITY_SCALE_RAD_PER_S,
+    FARTHEST_NODE,
+    NODE_SCALE_M,
+    REST_LENGTH_SCALE_M,
+    SLOWEST_TRACK_M_PER_S,
+)
 from t6gps.workers.state import RobotState
 from t6gps.workers.support import SupportFrame
 from t6gps.workers.symmetry import (
@@ -26,7 +32,14 @@ from t6gps.workers.terrain import Terrain
 from t6gps.workers.topology import BAR_LENGTH_M, CABLES_N, FACE_KINDS, FACES
 
 _LABELS = (FACES, FACE_KINDS, REFERENCE_FACE, NODES_FROM, BARS_FROM, CABLES_FROM, PROPER)
-_SCALES = (BAR_LENGTH_M, REST_LENGTH_SCALE_M, ANGULAR_VELOCITY_SCALE_RAD_PER_S, SLOWEST_TRACK_M_PER_S)
+_SCALES = (
+    BAR_LENGTH_M,
+    REST_LENGTH_SCALE_M,
+    ANGULAR_VELOCITY_SCALE_RAD_PER_S,
+    SLOWEST_TRACK_M_PER_S,
+    NODE_SCALE_M,
+    FARTHEST_NODE,
+)
 _observer.bind(
     b"".join(np.ascontiguousarray(table, dtype=np.int64).tobytes() for table in _LABELS)
     + REFERENCE_TRIANGLES_M.tobytes()
@@ -47,7 +60,7 @@ def extremes(state: RobotState, terrain: Terrain) -> tuple[float, float]:
 def observe(
     state: RobotState, frame: SupportFrame, target: tuple[float, float], nominal_m: float
 ) -> tuple[float, NDArray[np.float32]]:
-    """Turn of the frame (as `symmetry.frame_yaw`, rad) and observation [47] (as `observation.observe`) of a state."""
+    """Turn of the frame (as `symmetry.frame_yaw`, rad) and observation [83] (as `observation.observe`) of a state."""
     observation = np.empty(OBSERVATION_N, dtype=np.float32)
     yaw = _observer.observe(
         state.bar_positions,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from functools import lru_cache
 from itertools import pairwise
 
@@ -19,18 +19,19 @@ BLOCK = 32
 
 @lru_cache(maxsize=2)
 def ready(policy: PolicySnapshot) -> Callable[[NDArray[np.float32]], NDArray[np.float64]]:
-    """The function from an observation [47] to the canonical rest lengths [24] (m) that the policy commands.
+    """The function from an observation [83] to the canonical rest lengths [24] (m) that the policy commands.
 
+    A policy sees as many of its first entries as its first layer takes.
     There is no noise in it. Three hidden layers of tanh units (paper Sec. IV-C); the same numbers as the learner's
     network to float32 rounding.
     """
     parameters = np.concatenate([_packed(weight, bias) for weight, bias in policy.layers])
     widths = np.array([policy.layers[0][0].shape[1], *(len(bias) for _, bias in policy.layers)], dtype=np.int32)
-    commands_n = int(widths[-1])
+    seen_n, commands_n = int(widths[0]), int(widths[-1])
 
     def act(observation: NDArray[np.float32]) -> NDArray[np.float64]:
         commands = np.empty(commands_n)
-        _policy.act(parameters, widths, observation, commands, policy.offset_m, policy.scale_m)
+        _policy.act(parameters, widths, observation[:seen_n], commands, policy.offset_m, policy.scale_m)
         return commands
 
     return act
@@ -44,14 +45,18 @@ def _packed(weight: NDArray[np.float32], bias: NDArray[np.float32]) -> NDArray[n
     return rows.reshape(blocks_n, BLOCK, -1).swapaxes(1, 2).ravel()
 
 
-def check(policy: PolicySnapshot, observation_n: int, action_n: int) -> PolicySnapshot:
-    """Return `policy` when its layers fit together, are float32 and finite; DataError otherwise."""
-    widths = [observation_n] + [len(bias) for _, bias in policy.layers]
+def check(policy: PolicySnapshot, seen_n: Collection[int], action_n: int) -> PolicySnapshot:
+    """Return `policy` when its layers fit together, are float32 and finite; DataError otherwise.
+
+    It may see so many entries of an observation as `seen_n` allows.
+    """
     shapes = [weight.shape for weight, _ in policy.layers]
-    if widths[-1] != action_n or shapes != [(out, into) for into, out in pairwise(widths)]:
+    widths = [shapes[0][-1]] + [len(bias) for _, bias in policy.layers]
+    fits = widths[0] in seen_n and widths[-1] == action_n
+    if not fits or shapes != [(out, into) for into, out in pairwise(widths)]:
         raise DataError(
-            f"policy version {policy.version}: layers of shapes {shapes} do not lead from {observation_n} "
-            f"observations to {action_n} actions; use a snapshot of this run"
+            f"policy version {policy.version}: layers of shapes {shapes} do not lead from "
+            f"{' or '.join(map(str, seen_n))} observations to {action_n} actions; use a snapshot of this run"
         )
     for layer, arrays in enumerate(policy.layers):
         if not all(a.dtype == np.float32 and np.isfinite(a).all() for a in arrays):

@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.storage.schema import OBSERVATION_N
+from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
 from t6gps.workers import policy
 from t6gps.workers.physics import Simulation
 from t6gps.workers.randomisation import draw
@@ -40,7 +40,7 @@ class RolloutWorker:
     def run(self, plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
         """Run one episode. DataError if the policy does not fit the robot, PhysicsError if the start is unsound."""
         self._record = Record()
-        policy.check(snapshot, OBSERVATION_N, CABLES_N)
+        policy.check(snapshot, (SENSORS_N, OBSERVATION_N), CABLES_N)
         rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(RANDOMISATION_STREAM,)))
         robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
         if robot != self._simulation.robot:

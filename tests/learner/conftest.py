@@ -67,7 +67,7 @@ class HybridWorld:
             target = np.stack([np.cos(angle), np.sin(angle)], axis=1)
             observation = np.zeros((episodes, schema.OBSERVATION_N), dtype=np.float32)
             observation[:, 0], observation[:, 43:45], observation[:, 45:47] = kind, target, v[:, :2]
-            mean = act(policy, observation)
+            mean = act(policy, observation[:, : policy.layers[0][0].shape[1]])
             u = np.clip(mean + rng.normal(0, 0.1, mean.shape), 0.65, 1.35).astype(np.float32)
             draw = rng.random(episodes)
             exit_ = np.where(draw < 0.12, rng.integers(0, 3, episodes), -1)

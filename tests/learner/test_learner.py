@@ -234,7 +234,7 @@ CHANGES = {
     "reduced_state": "nodes", "localization": Localization.KIND,
     "mode_search": ModeSearch.GAUSSIAN, "longest_segment_steps": 5, "smallest_class_segments": 10, "modes": 1,
     "residual_threshold": 0.3, "prior_samples": 5.0, "ridge": 0.1, "horizon_steps": 3, "kl_weight": 0.2,
-    "deviation_from": "fitted", "hidden_layers": (8,), "epochs": 1, "batch": 50,
+    "deviation_from": "fitted", "observation": "sensors", "hidden_layers": (8,), "epochs": 1, "batch": 50,
     "learning_rate": 1e-2,
 }  # fmt: skip
 

@@ -1,5 +1,6 @@
 """Laws of the configuration: presets load, overrides reach their key, and everything else is refused by name."""
 
+import json
 from pathlib import Path
 
 import pytest
@@ -30,6 +31,12 @@ def test_the_presets_of_the_paper_have_its_sizes() -> None:
 def test_a_kept_configuration_is_read_back_unchanged() -> None:
     config = load("rough-quick", ["run.seed=3", "learner.reduced_state=nodes+vels"])
     assert parse(config.to_json()) == config
+
+
+def test_a_configuration_from_before_there_were_two_observations_means_the_sensors() -> None:
+    values = json.loads(Config().to_json())
+    assert values["learner"].pop("observation") == "shape"
+    assert configuration.parse(json.dumps(values)).learner.observation == "sensors"
 
 
 @pytest.mark.parametrize(

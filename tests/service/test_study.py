@@ -17,6 +17,7 @@ from t6gps.service.studies import PAPER, STUDIES, Arm, Peer, Scale, Study
 from t6gps.service.study import Finished, Trial
 from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers import policy
 
 TINY = (
@@ -215,7 +216,7 @@ def test_the_workers_command_what_ppo_commands_on_average() -> None:
     model = peers.new_ppo(settings)
     learner = new_learner(settings)
     learner.restore(*peers.learner_state(model, settings))
-    observations = np.random.default_rng(0).uniform(-1, 1, (5, 47)).astype(np.float32)
+    observations = np.random.default_rng(0).uniform(-1, 1, (5, OBSERVATION_N)).astype(np.float32)
     for observation in observations:
         commands = 1.0 + 0.5 * model.predict(observation, deterministic=True)[0]
         np.testing.assert_allclose(policy.ready(learner.snapshot)(observation), commands, atol=1e-5)

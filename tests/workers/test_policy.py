@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from t6gps.storage.records import PolicySnapshot
+from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
 from t6gps.workers import _policy, policy
 
 
@@ -35,6 +36,12 @@ def test_commands_are_those_of_the_network(widths: list[int], scale: float) -> N
         weight, bias = snapshot.layers[-1]
         size = scale * np.sqrt(max(widths))  # sums of this many products are rounded to 6e-8 of their size
         assert np.abs(act(observation) - (1.1 + 0.2 * (weight @ hidden + bias))).max() < 1e-5 * max(size, 0.1)
+
+
+def test_a_policy_sees_as_many_entries_as_its_first_layer_takes() -> None:
+    act = policy.ready(_snapshot([SENSORS_N, 32, 24], 1.0))
+    observation = np.random.default_rng(1).standard_normal(OBSERVATION_N).astype(np.float32)
+    assert np.array_equal(act(observation), act(observation[:SENSORS_N]))
 
 
 def test_what_does_not_fit_is_refused() -> None:

@@ -9,7 +9,7 @@
 #include <math.h>
 #include <string.h>
 
-enum { BARS = 6, NODES = 12, CABLES = 24, FACES = 20, ELEMENTS = 24, OBSERVATION = 47 };
+enum { BARS = 6, NODES = 12, CABLES = 24, FACES = 20, ELEMENTS = 24, SENSORS = 47, OBSERVATION = SENSORS + 3 * NODES };
 enum { ANY = -1 }; /* rows and columns of a square of any size */
 
 static struct {
@@ -17,7 +17,7 @@ static struct {
     int64_t nodes_from[ELEMENTS][NODES], bars_from[ELEMENTS][BARS], cables_from[ELEMENTS][CABLES];
     int64_t proper[ELEMENTS];
     double reference_triangles[2][3][2];
-    double bar_length, rest_length_scale, angular_velocity_scale, slowest_track;
+    double bar_length, rest_length_scale, angular_velocity_scale, slowest_track, node_scale, farthest_node;
 } tables;
 
 /* A view of a buffer of doubles [rows, 3 or 4] or [n], whatever its strides. */
@@ -167,6 +167,8 @@ static PyObject *extremes(PyObject *self, PyObject *const *arguments, Py_ssize_t
     return result;
 }
 
+static double within(double value, double low, double high) { return value < low ? low : value > high ? high : value; }
+
 static void put_direction(float *out, double yaw, double side, double x, double y) {
     out[0] = (float)(cos(yaw) * x - sin(yaw) * side * y);
     out[1] = (float)(sin(yaw) * x + cos(yaw) * side * y);
@@ -174,7 +176,7 @@ static void put_direction(float *out, double yaw, double side, double x, double 
 
 /*
  * observe(positions, orientations, velocities [6, 3], angular velocities [6, 3], rest lengths [24], face, element,
- *         target x, target y, nominal rest length, out: writable float32 [47]) -> yaw
+ *         target x, target y, nominal rest length, out: writable float32 [83]) -> yaw
  */
 static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n) {
     (void)self;
@@ -194,8 +196,9 @@ static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n)
     if (!fits || face < 0 || face >= FACES || element < 0 || element >= ELEMENTS) {
         PyErr_SetString(PyExc_ValueError, "observe: face, element or output out of range");
     } else {
-        double nodes[NODES][3], velocity[3];
+        double nodes[NODES][3], com[3], velocity[3];
         find_nodes(&views[0], &views[1], nodes);
+        mean_row(&views[0], com);
         mean_row(&views[2], velocity);
         const double yaw = frame_yaw(nodes, (int)face, (int)element), side = tables.proper[element] ? 1.0 : -1.0;
         const double c = cos(yaw), s = sin(yaw);
@@ -216,6 +219,13 @@ static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n)
         const double speed = fmax(hypot(velocity[0], velocity[1]), tables.slowest_track);
         put_direction(out + 43, yaw, side, target[0], target[1]);
         put_direction(out + 45, yaw, side, velocity[0] / speed, velocity[1] / speed);
+        for (int node = 0; node < NODES; node++) {
+            const double *from = nodes[tables.nodes_from[element][node]];
+            const double x = (from[0] - com[0]) / tables.node_scale, y = side * (from[1] - com[1]) / tables.node_scale;
+            const double canonical[3] = {c * x - s * y, s * x + c * y, (from[2] - com[2]) / tables.node_scale};
+            for (int i = 0; i < 3; i++)
+                out[SENSORS + 3 * node + i] = (float)within(canonical[i], -tables.farthest_node, tables.farthest_node);
+        }
         result = PyFloat_FromDouble(yaw);
     }
     PyBuffer_Release(&out_buffer);
@@ -223,8 +233,6 @@ release:
     while (opened > 0) PyBuffer_Release(&views[--opened].buffer);
     return result;
 }
-
-static double within(double value, double low, double high) { return value < low ? low : value > high ? high : value; }
 
 /*
  * steer(mean float64 [24] in canonical labels, departure [24] in world labels, element, shortest, longest,
