@@ -104,7 +104,9 @@ STANDARD_GPS = (
     "learner.horizon_steps=16",
     "learner.smallest_class_segments=1",
 )
-"""Algorithm 1 with the paper's J = 36 directions, T = 16 steps and 10 iterations; the scale gives N."""
+"""Algorithm 1 with the paper's J = 36 directions, T = 16 steps and 10 iterations."""
+STANDARD_SIZES = {Scale.QUICK: ("run.episodes=360",), Scale.PAPER: ("run.episodes=1800",)}
+"""N: 10 samples of each direction, and the paper's 50."""
 
 LOCALIZATIONS = {
     "segments": (),
@@ -186,13 +188,13 @@ STUDIES = {
         ),
         arms={
             "t6gps": Arm("T6-GPS", "flat ground", "flat", sizes={Scale.PAPER: ("run.episodes=100",)}),
-            "standard": Arm(
-                "standard GPS",
-                "flat ground",
-                "flat",
-                STANDARD_GPS,
-                sizes={Scale.QUICK: ("run.episodes=360",), Scale.PAPER: ("run.episodes=1800",)},
-            ),
+            **{
+                name: Arm(label, "flat ground", "flat", (*STANDARD_GPS, *overrides), sizes=STANDARD_SIZES)
+                for name, label, overrides in (
+                    ("standard", "standard GPS", ()),
+                    ("standard-plain", "standard GPS, no shrinkage", ("learner.prior_samples=0",)),
+                )
+            },
         },
         quick=("run.episodes=60",),
         quick_seeds=3,
