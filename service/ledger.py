@@ -156,6 +156,10 @@ class Ledger:
         self._in_a_row += 1
         return True
 
+    def hangs_n(self, plan: EpisodePlan) -> int:
+        """Attempts of a plan of this book that were ended because they took too long."""
+        return sum(failure.kind == "hang" for failure in self.failures.get(plan.episode_id, ()))
+
     def state(self) -> dict[str, Any]:
         """What a resumed run goes on with: the counters. Which episodes are missing stands in spool and bundles."""
         return {"counters": dict(self.counters)}

@@ -192,7 +192,10 @@ class Pool:
     def _begin(self, worker: Worker, now: float) -> None:
         """The worker comes to the first of its plans."""
         worker.phase, worker.since_s, worker.answered = ("sampling" if worker.plans else "idle"), now, True
-        worker.deadline_s = now + self._times.deadline_s(worker.plans[0].steps) if worker.plans else math.inf
+        worker.deadline_s = math.inf
+        if worker.plans:
+            plan = worker.plans[0]
+            worker.deadline_s = now + self._times.deadline_s(plan.steps) * 2 ** self.ledger.hangs_n(plan)
 
     def _failed(self, plan: EpisodePlan, failure: Failure) -> None:
         self._last_trouble = f"episode {plan.episode_id}: {failure}"

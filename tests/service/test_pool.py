@@ -261,6 +261,16 @@ def test_a_hang_is_found_by_its_deadline_and_its_stacks_are_kept() -> None:
     assert house.pool.counters["hung"] == 1
 
 
+def test_an_episode_that_hangs_again_gets_twice_the_time() -> None:
+    house = House(2, 30)
+    house.paper.hanging.add(7)
+    assert sorted(house.sample()) == [number for number in range(30) if number != 7]
+    first_s, second_s, third_s = (float(failure.message.split()[-2]) for failure in house.ledger.failures[7])
+    assert second_s > 1.9 * first_s
+    assert third_s > 1.9 * second_s
+    assert house.ledger.quarantined == {7}
+
+
 def test_a_worker_ten_times_slower_does_not_hang() -> None:
     house = House(1, 5)
     list(house.sample())
