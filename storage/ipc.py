@@ -1,6 +1,6 @@
 """A table as one piece of memory, an Arrow IPC stream: how it is sent to another process, and written to a file.
 
-The reader's table lies in the same memory; a generic pickle handles each column and buffer by itself, ten times slower.
+The reader's table lies in the same memory; a generic pickle handles each column and each buffer by itself.
 """
 
 from __future__ import annotations
