@@ -77,8 +77,8 @@ AS_IN_THE_PAPER = (
     "exploration.quiet_share=0",
     "learner.replay_iterations=1",
 )
-"""Cost, network, observation and exploration of the paper (Sec. IV-A, IV-C), under which its claims are checked; replay as by default,
-which the preset rough does without.
+"""Cost, network, observation and exploration of the paper (Sec. IV-A, IV-C), under which its claims are checked;
+and replay, as by default, which the preset rough does without.
 
 The KL term weighs as much beside the gradient of the cost as it does by default.
 """
