@@ -73,7 +73,7 @@ class Spool:
         for path in sorted(self._folder.glob("episode-*.arrow")):
             try:
                 source = pa.BufferReader(path.read_bytes())
-                frames, summary = (pa.ipc.open_stream(source).read_all() for _ in range(2))
+                frames, summary = (ipc.unpack(source) for _ in range(2))
                 episode = checked(Episode(frames, summary), self.iteration)
             except (pa.ArrowException, OSError, DataError) as error:
                 self.torn += 1

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection
+from collections.abc import Callable
 from functools import lru_cache
 from itertools import pairwise
 
@@ -45,7 +45,8 @@ def _packed(weight: NDArray[np.float32], bias: NDArray[np.float32]) -> NDArray[n
     return rows.reshape(blocks_n, BLOCK, -1).swapaxes(1, 2).ravel()
 
 
-def check(policy: PolicySnapshot, seen_n: Collection[int], action_n: int) -> PolicySnapshot:
+@lru_cache(maxsize=2)
+def check(policy: PolicySnapshot, seen_n: tuple[int, ...], action_n: int) -> PolicySnapshot:
     """Return `policy` when its layers fit together, are float32 and finite; DataError otherwise.
 
     It may see so many entries of an observation as `seen_n` allows.
