@@ -130,10 +130,10 @@ def footprints(finished: Sequence[Finished]) -> Figure:
 
 def _world_nodes(frames: pa.Table) -> Array:
     """Nodes [T + 1, 12, 3] (m) from the recorded bars."""
-    positions, turns = numbers(frames, "bar_positions"), numbers(frames, "bar_orientations")
-    still = np.zeros((len(positions), 6, 3))
-    state = RobotState(positions.reshape(-1, 6, 3), turns.reshape(-1, 6, 4), still, still, np.zeros((len(still), 24)))
-    return state.nodes()
+    positions = numbers(frames, "bar_positions").reshape(-1, 6, 3)
+    orientations = numbers(frames, "bar_orientations").reshape(-1, 6, 4)
+    still, lengths = np.zeros_like(positions), np.zeros((len(positions), 24))
+    return RobotState.of(positions, orientations, still, still, lengths).nodes()
 
 
 def climb(finished: Sequence[Finished]) -> Figure:

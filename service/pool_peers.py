@@ -43,7 +43,7 @@ class PlannedEnvironment(gymnasium.Wrapper[Floats, Floats, Floats, Floats]):
         """Start the next episode of the job, whatever `seed` says."""
         plan = next(self._plans)
         rng = np.random.default_rng(plan.seed)
-        self._noise = exploration.noise(rng, plan.noise_std_m, self._correlation, plan.steps)
+        self._noise = iter(exploration.noise(rng, plan.noise_std_m, self._correlation, plan.steps))
         return self.env.reset(seed=plan.seed, options={"terrain_seed": plan.terrain_seed})
 
     def step(self, action: Floats) -> tuple[Floats, Any, bool, bool, dict[str, Any]]:

@@ -2,12 +2,9 @@ from numpy import float32, float64
 from numpy.typing import NDArray
 
 def bind(tables: bytes, /) -> None: ...
-def survey(positions: NDArray[float64], orientations: NDArray[float64], /) -> tuple[int, float, float, float]: ...
+def survey(bars: NDArray[float64], /) -> tuple[int, float, float, float]: ...
 def observe(
-    positions: NDArray[float64],
-    orientations: NDArray[float64],
-    velocities: NDArray[float64],
-    angular_velocities: NDArray[float64],
+    bars: NDArray[float64],
     rest_lengths: NDArray[float64],
     face: int,
     element: int,
@@ -17,9 +14,7 @@ def observe(
     out: NDArray[float32],
     /,
 ) -> float: ...
-def extremes(
-    positions: NDArray[float64], orientations: NDArray[float64], heights: NDArray[float64], cell_m: float, /
-) -> tuple[float, float]: ...
+def extremes(bars: NDArray[float64], heights: NDArray[float64], cell_m: float, /) -> tuple[float, float]: ...
 def steer(
     mean: NDArray[float64],
     departure: NDArray[float64],

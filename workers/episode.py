@@ -52,7 +52,8 @@ class RunningEpisode:
         simulation.set_ground(terrain)
         self._simulation = simulation
         self._sensor_noise = settings.randomisation.sensor_noise
-        self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
+        if self._sensor_noise:
+            self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
         self._nominal_m = nominal_m
         self._step = 0
         if task.directions:

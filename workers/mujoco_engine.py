@@ -56,7 +56,7 @@ class MujocoStepper:
         poses, velocities = self.data.qpos.reshape(BARS_N, 7), self.data.qvel.reshape(BARS_N, 6)
         orientations = np.roll(poses[:, 3:], -1, axis=1)
         angular_velocities = _turned(velocities[:, 3:], orientations)  # MuJoCo has them in the axes of the bars
-        return RobotState(poses[:, :3].copy(), orientations, velocities[:, :3].copy(), angular_velocities, rest_lengths)
+        return RobotState.of(poses[:, :3], orientations, velocities[:, :3], angular_velocities, rest_lengths)
 
     def control_step(self, _: list[int], rest_lengths: Array, command: Array) -> RobotState:
         """State after one control step under `command` [24] (m)."""

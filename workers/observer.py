@@ -49,12 +49,12 @@ _observer.bind(
 
 def survey(state: RobotState) -> tuple[int, float, float, float]:
     """Support face (as `support.support_face`) and centre of mass x, y, z (m) of a state."""
-    return _observer.survey(state.bar_positions, state.bar_orientations)
+    return _observer.survey(state.bars)
 
 
 def extremes(state: RobotState, terrain: Terrain) -> tuple[float, float]:
     """Largest |x| or |y| (m) of the nodes, and how deep the deepest lies below the ground (m; negative above it)."""
-    return _observer.extremes(state.bar_positions, state.bar_orientations, terrain.heights, terrain.cell_m)
+    return _observer.extremes(state.bars, terrain.heights, terrain.cell_m)
 
 
 def observe(
@@ -63,10 +63,7 @@ def observe(
     """Turn of the frame (as `symmetry.frame_yaw`, rad) and observation [83] (as `observation.observe`) of a state."""
     observation = np.empty(OBSERVATION_N, dtype=np.float32)
     yaw = _observer.observe(
-        state.bar_positions,
-        state.bar_orientations,
-        state.bar_velocities,
-        state.bar_angular_velocities,
+        state.bars,
         state.rest_lengths,
         frame.face,
         frame.element,

@@ -54,7 +54,7 @@ def neutral_state(robot: RobotSettings, height_m: float = BAR_LENGTH_M / 2 + 0.1
     axes = (first - second) / BAR_LENGTH_M
     # The shortest rotation from z to an axis n is the normalised quaternion (z x n, 1 + z . n); no axis is -z.
     orientations = np.stack([-axes[:, 1], axes[:, 0], np.zeros(BARS_N), 1 + axes[:, 2]], axis=1)
-    state = RobotState(
+    state = RobotState.of(
         (first + second) / 2 + [0.0, 0.0, height_m],
         orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
         np.zeros((BARS_N, 3)),

@@ -85,5 +85,4 @@ class PluginStepper:
         block = self._block
         block["bodies"], block["rest"], block["command"] = bodies, rest_lengths, command
         self._call("", [])
-        bars = block["bars"].copy()
-        return RobotState(bars[:, :3], bars[:, 3:7], bars[:, 7:10], bars[:, 10:], block["rest"].copy())
+        return RobotState(block["bars"].copy(), block["rest"].copy())

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
-from operator import attrgetter
 from typing import Any
 
 import numpy as np
@@ -60,7 +59,8 @@ class Outcome:
 def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings) -> Episode:
     """The two tables of an episode; whoever hands them on checks them."""
     rows = len(record.states)
-    state = RobotState(*(_stacked(list(map(attrgetter(name), record.states))) for name in RobotState.__annotations__))
+    states = record.states
+    state = RobotState(_stacked([s.bars for s in states]), _stacked([s.rest_lengths for s in states]))
     element = np.array([frame.element for frame in record.frames])
     yaw = np.array(record.yaws_rad)
     number, waypoint_x, waypoint_y = (np.array(column) for column in zip(*record.waypoints, strict=True))
@@ -141,7 +141,7 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
     }
     return Episode(
         pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
-        pa.Table.from_pylist([summary], schema=EPISODES),
+        pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
     )
 
 

@@ -60,7 +60,7 @@ def read_state(client: int, bodies: list[int], rest_lengths: Array) -> RobotStat
     """State of the bars with these body numbers of a PyBullet client."""
     poses = [pybullet.getBasePositionAndOrientation(body, physicsClientId=client) for body in bodies]
     velocities = [pybullet.getBaseVelocity(body, physicsClientId=client) for body in bodies]
-    return RobotState(
+    return RobotState.of(
         np.array([position for position, _ in poses]),
         np.array([orientation for _, orientation in poses]),
         np.array([linear for linear, _ in velocities]),

@@ -116,7 +116,7 @@ def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Sc
         for name, n in (("bar_positions", 3), ("bar_orientations", 4))
     )
     rest = np.zeros_like(positions)
-    state = RobotState(positions, orientations, rest, rest, np.zeros((len(rest), CABLES_N)))
+    state = RobotState.of(positions, orientations, rest, rest, np.zeros((len(rest), CABLES_N)))
     com, nodes, time_s = state.com, state.nodes(), _numbers(frames, "time_s")
     waypoint = np.column_stack([_numbers(frames, "waypoint_x_m"), _numbers(frames, "waypoint_y_m")])
     weights = np.exp(-0.5 * ((time_s[:, None] - time_s) / SMOOTHING_S) ** 2)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from contextlib import suppress
-from dataclasses import replace
 from functools import lru_cache
 
 import numpy as np
@@ -12,7 +11,7 @@ from numpy.typing import NDArray
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.workers.physics import Simulation, neutral_state, nominal_rest_length
 from t6gps.workers.settings import RobotSettings
-from t6gps.workers.state import RobotState
+from t6gps.workers.state import RobotState, cross
 from t6gps.workers.terrain import Terrain
 from t6gps.workers.topology import CABLES_N, FACES, NODES_M
 
@@ -51,7 +50,7 @@ def _fall(
     lengths = lengths.clip(robot.shortest_command_m, robot.longest_command_m)
     offset = np.array([*place, 0.0]) - [*turned.com[:2], 0.0]
     offset[2] = robot.bar_radius_m + CLEARANCE_M - _lowest_clearance(turned.nodes() + offset, terrain)
-    state = replace(turned, bar_positions=turned.bar_positions + offset, rest_lengths=lengths)
+    state = turned.but(bar_positions=turned.bar_positions + offset, rest_lengths=lengths)
     simulation.reset(state)
     for _ in range(SETTLE_STEPS):
         state = simulation.control_step(lengths)
@@ -115,11 +114,11 @@ def turn(state: RobotState, q: NDArray[np.float64]) -> RobotState:
     centre = state.com
     v, w = q[:3], q[3]
     arms = state.bar_positions - centre
-    arms = arms + 2 * np.cross(v, np.cross(v, arms) + w * arms)
+    arms = arms + 2 * cross(v, cross(v, arms) + w * arms)
     b = state.bar_orientations
-    vectors = w * b[:, :3] + b[:, 3:] * v + np.cross(v, b[:, :3])
+    vectors = w * b[:, :3] + b[:, 3:] * v + cross(v, b[:, :3])
     scalars = w * b[:, 3] - b[:, :3] @ v
-    return replace(state, bar_positions=arms + centre, bar_orientations=np.column_stack([vectors, scalars]))
+    return state.but(bar_positions=arms + centre, bar_orientations=np.column_stack([vectors, scalars]))
 
 
 def _lowest_clearance(nodes: NDArray[np.float64], terrain: Terrain | None) -> float:

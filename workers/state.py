@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Self
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,6 +19,7 @@ class RobotState:
 
     All arrays may carry the same leading axes, time for instance.
 
+    bars                     per bar [..., 6, 13] what follows, side by side
     bar_positions            centres [..., 6, 3] (m)
     bar_orientations         unit quaternions x y z w [..., 6, 4]
     bar_velocities           velocities of the centres [..., 6, 3] (m/s)
@@ -25,11 +27,42 @@ class RobotState:
     rest_lengths             [..., 24] (m)
     """
 
-    bar_positions: Array
-    bar_orientations: Array
-    bar_velocities: Array
-    bar_angular_velocities: Array
+    bars: Array
     rest_lengths: Array
+
+    @classmethod
+    def of(
+        cls,
+        bar_positions: Array,
+        bar_orientations: Array,
+        bar_velocities: Array,
+        bar_angular_velocities: Array,
+        rest_lengths: Array,
+    ) -> Self:
+        """The state with these parts."""
+        parts = (bar_positions, bar_orientations, bar_velocities, bar_angular_velocities)
+        return cls(np.concatenate(parts, axis=-1), rest_lengths)
+
+    def but(self, **parts: Array) -> RobotState:
+        """This state with other `parts`, named as the arguments of `of`."""
+        names = ("bar_positions", "bar_orientations", "bar_velocities", "bar_angular_velocities", "rest_lengths")
+        return RobotState.of(**({name: getattr(self, name) for name in names} | parts))
+
+    @property
+    def bar_positions(self) -> Array:
+        return self.bars[..., :3]
+
+    @property
+    def bar_orientations(self) -> Array:
+        return self.bars[..., 3:7]
+
+    @property
+    def bar_velocities(self) -> Array:
+        return self.bars[..., 7:10]
+
+    @property
+    def bar_angular_velocities(self) -> Array:
+        return self.bars[..., 10:]
 
     @property
     def com(self) -> Array:
@@ -47,7 +80,7 @@ class RobotState:
 
     def node_velocities(self) -> Array:
         """Velocities of the nodes [..., 12, 3] (m/s)."""
-        return _at_both_ends(self.bar_velocities, np.cross(self.bar_angular_velocities, self.arms()))
+        return _at_both_ends(self.bar_velocities, cross(self.bar_angular_velocities, self.arms()))
 
     def arms(self) -> Array:
         """From each bar's centre to its first node [..., 6, 3] (m)."""
@@ -58,6 +91,11 @@ class RobotState:
         axes[..., 2] = 0.5 - x * x - y * y
         axes *= BAR_LENGTH_M
         return axes
+
+
+def cross(a: Array, b: Array) -> Array:
+    """Cross product of vectors [..., 3], several times faster than numpy.cross for few of them."""
+    return a[..., [1, 2, 0]] * b[..., [2, 0, 1]] - a[..., [2, 0, 1]] * b[..., [1, 2, 0]]
 
 
 def _at_both_ends(centres: Array, arms: Array) -> Array:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from math import hypot
+from math import cos, hypot, pi, sin
 
 import numpy as np
 from numpy.typing import NDArray
@@ -25,15 +25,15 @@ FAR_WAYPOINT_M = 1000.0
 def random_waypoints(rng: np.random.Generator, start: Array, settings: TaskSettings) -> Array:
     """A chain of waypoints [n, 2] (m) from `start` [2], in random directions, all within the area."""
     waypoints = np.empty((settings.waypoints, 2))
-    place = start
+    place = tuple(start)
     for i in range(settings.waypoints):
         inside = False
         while not inside:
             distance = rng.uniform(settings.nearest_waypoint_m, settings.farthest_waypoint_m)
-            angle = rng.uniform(-np.pi, np.pi)
-            waypoints[i] = place + distance * np.array([np.cos(angle), np.sin(angle)])
-            inside = bool(np.abs(waypoints[i]).max() <= AREA_HALF_WIDTH_M)
-        place = waypoints[i]
+            angle = rng.uniform(-pi, pi)
+            x, y = place[0] + distance * cos(angle), place[1] + distance * sin(angle)
+            inside = max(abs(x), abs(y)) <= AREA_HALF_WIDTH_M
+        place = waypoints[i] = x, y
     return waypoints
 
 

@@ -76,12 +76,10 @@ def test_steering_keeps_to_the_range_and_maps_labels_back() -> None:
 
 def test_what_does_not_fit_is_refused(states: list[RobotState]) -> None:
     state = states[0]
-    short = RobotState(state.bar_positions[:5], *(getattr(state, n) for n in list(RobotState.__annotations__)[1:]))
-    single = RobotState(
-        state.bar_positions.astype(np.float32), *(getattr(state, n) for n in list(RobotState.__annotations__)[1:])
-    )
+    short = RobotState(state.bars[:5], state.rest_lengths)
+    single = RobotState(state.bars.astype(np.float32), state.rest_lengths)
     for bad in (short, single):
-        with pytest.raises(ValueError, match=r"expected float64 \[6, 3\]"):
+        with pytest.raises(ValueError, match=r"expected float64 \[6, 13\]"):
             observer.survey(bad)
     with pytest.raises(ValueError, match=r"expected float64 \[n, n\]"):
         observer.extremes(state, Terrain(np.zeros((3, 4)), 0.5))

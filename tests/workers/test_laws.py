@@ -1,7 +1,5 @@
 """Laws of mechanics that the whole simulation keeps, contacts included."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 
@@ -41,8 +39,7 @@ def thrown(rng: np.random.Generator, height_m: float) -> RobotState:
     """A robot in a random orientation and shape, thrown sideways."""
     quaternion = rng.standard_normal(4)
     state = turn(neutral_state(ROBOT, height_m), quaternion / np.linalg.norm(quaternion))
-    return replace(
-        state,
+    return state.but(
         rest_lengths=state.rest_lengths + rng.uniform(-0.15, 0.15, CABLES_N),
         bar_velocities=state.bar_velocities + 1.5 * rng.standard_normal(3),
     )

@@ -9,7 +9,6 @@ import json
 import subprocess
 import sys
 from collections.abc import Iterator
-from dataclasses import replace
 from pathlib import Path
 
 import mujoco
@@ -54,7 +53,7 @@ def _motion(simulation: Simulation, start: RobotState, commands: Array) -> list[
 def _lowest_at(state: RobotState, height_m: float) -> RobotState:
     """The state lifted so that its lowest node clears the plane by `height_m`."""
     lift = ROBOT.bar_radius_m + height_m - state.nodes()[:, 2].min()
-    return replace(state, bar_positions=state.bar_positions + [0.0, 0.0, lift])
+    return state.but(bar_positions=state.bar_positions + [0.0, 0.0, lift])
 
 
 def on_face(face: int) -> RobotState:
@@ -72,8 +71,7 @@ def rolling(number: int, of: int) -> RobotState:
     state = turn(on_face(3 * number % FACES_N), np.array([0.0, 0.0, np.sin(angle), np.cos(angle)]))
     velocity = (1.0 + 1.5 * number / (of - 1)) * np.array([np.cos(3 * angle), np.sin(3 * angle), 0.0])
     turning = np.cross([0.0, 0.0, 1.0], velocity) / state.com[2]
-    return replace(
-        state,
+    return state.but(
         bar_velocities=velocity + np.cross(turning, state.bar_positions - state.com),
         bar_angular_velocities=np.tile(turning, (6, 1)),
     )
@@ -114,10 +112,10 @@ def rough_fall(engines: Engines, seed: int) -> float:
     rng = np.random.default_rng(seed)
     quaternion = rng.standard_normal(4)
     state = turn(neutral_state(ROBOT), quaternion / np.linalg.norm(quaternion))
-    state = replace(state, bar_positions=state.bar_positions + [*rng.uniform(-6.0, 6.0, 2), 0.0])
+    state = state.but(bar_positions=state.bar_positions + [*rng.uniform(-6.0, 6.0, 2), 0.0])
     nodes = state.nodes()
     lift = (ROUGH.height(nodes[:, 0], nodes[:, 1]) - nodes[:, 2]).max() + 0.2
-    start = replace(state, bar_positions=state.bar_positions + [0.0, 0.0, lift])
+    start = state.but(bar_positions=state.bar_positions + [0.0, 0.0, lift])
     one, other = (_motion(engine, start, np.tile(HOLD, (10, 1)))[-1].com for engine in engines)
     return float(np.linalg.norm(one - other))
 
@@ -129,8 +127,7 @@ def rough_fall(engines: Engines, seed: int) -> float:
 def test_flight_with_slack_cables_agrees_to_rounding(engines: Engines, seed: int) -> None:
     """Measured over 1 s: 4e-14 m, while the bars do not touch each other. The model's own cables differ by 2 cm."""
     rng = np.random.default_rng(seed)
-    start = replace(
-        neutral_state(ROBOT, 50.0),
+    start = neutral_state(ROBOT, 50.0).but(
         bar_velocities=rng.normal(0.0, 0.5, (6, 3)),
         bar_angular_velocities=rng.normal(0.0, 1.5, (6, 3)),
         rest_lengths=rng.uniform(0.9, 1.35, CABLES_N),
@@ -227,7 +224,7 @@ def test_a_reset_forgets_the_past(ground: Terrain | None) -> None:
 
 def test_a_reset_gives_the_state_back() -> None:
     rng = np.random.default_rng(1)
-    start = replace(turn(on_face(3), np.array([0.5, 0.5, 0.5, 0.5])), bar_angular_velocities=rng.normal(size=(6, 3)))
+    start = turn(on_face(3), np.array([0.5, 0.5, 0.5, 0.5])).but(bar_angular_velocities=rng.normal(size=(6, 3)))
     with MujocoSimulation(ROBOT) as simulation:
         simulation.reset(start)
         for name, value in vars(simulation.state()).items():
@@ -236,12 +233,12 @@ def test_a_reset_gives_the_state_back() -> None:
 
 def test_unsound_states_are_refused_as_in_the_first_engine() -> None:
     with MujocoSimulation(ROBOT) as simulation:
-        simulation.reset(replace(neutral_state(ROBOT, 50.0), bar_velocities=np.full((6, 3), 80.0)))
+        simulation.reset(neutral_state(ROBOT, 50.0).but(bar_velocities=np.full((6, 3), 80.0)))
         with pytest.raises(PhysicsError, match="became unstable"):
             simulation.control_step(HOLD)
         simulation.set_ground(generate(0, 0.5, 10.0))
         start = neutral_state(ROBOT, 1.6)
-        simulation.reset(replace(start, bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
+        simulation.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
         with pytest.raises(PhysicsError, match="beyond the ground's side at 5"):
             simulation.control_step(HOLD)
     with pytest.raises(PhysicsError, match=r"must divide the control step.*choose"):
@@ -294,7 +291,7 @@ def test_the_controls_of_the_exported_model_are_changes_of_rest_lengths() -> Non
     offsets = np.random.default_rng(0).uniform(-0.2, 0.05, CABLES_N)
     data.ctrl[:CABLES_N] = offsets
     mujoco.mj_forward(model, data)
-    wanted, _ = tensions(replace(state, rest_lengths=state.rest_lengths + offsets), ROBOT)
+    wanted, _ = tensions(state.but(rest_lengths=state.rest_lengths + offsets), ROBOT)
     np.testing.assert_allclose(-data.actuator_force[:CABLES_N], wanted, rtol=1e-9)
 
 

@@ -6,7 +6,6 @@ import hashlib
 import subprocess
 import sys
 import tracemalloc
-from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -57,14 +56,13 @@ def _on_a_delta() -> RobotState:
     half_way = np.append(np.cross(down, [0.0, 0.0, -1.0]), 1 - down[2])
     turned = turn(neutral_state(ROBOT), half_way / np.linalg.norm(half_way))
     lift = [0.0, 0.0, ROBOT.bar_radius_m - turned.nodes()[:, 2].min()]
-    return replace(turned, bar_positions=turned.bar_positions + lift)
+    return turned.but(bar_positions=turned.bar_positions + lift)
 
 
 def _stirred(state: RobotState, seed: int) -> RobotState:
     """The state with random velocities and rest lengths."""
     rng = np.random.default_rng(seed)
-    return replace(
-        state,
+    return state.but(
         bar_velocities=state.bar_velocities + rng.normal(0.0, 0.3, (6, 3)),
         bar_angular_velocities=rng.normal(0.0, 1.0, (6, 3)),
         rest_lengths=state.rest_lengths + rng.uniform(-0.1, 0.1, CABLES_N),
@@ -78,7 +76,7 @@ def test_cables_never_push_and_keep_their_bounds() -> None:
     rng = np.random.default_rng(0)
     for seed in range(50):
         state = _stirred(neutral_state(ROBOT), seed)
-        state = replace(state, rest_lengths=rng.uniform(0.2, 1.4, CABLES_N))
+        state = state.but(rest_lengths=rng.uniform(0.2, 1.4, CABLES_N))
         tension, _ = tensions(state, ROBOT)
         nodes = state.nodes()
         lengths = np.linalg.norm(nodes[CABLES[:, 1]] - nodes[CABLES[:, 0]], axis=1)
@@ -155,7 +153,7 @@ def _image(state: RobotState, element: int, yaw: float) -> RobotState:
     axes = (nodes[0::2] - nodes[1::2]) / BAR_LENGTH_M
     # Any turn that carries z to the axis will do, for bars are round; the tests avoid the axis -z.
     quaternions = np.stack([-axes[:, 1], axes[:, 0], np.zeros(6), 1 + axes[:, 2]], axis=1)
-    return RobotState(
+    return RobotState.of(
         (state.bar_positions @ world.T)[bars],
         quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
         (state.bar_velocities @ world.T)[bars],
@@ -360,7 +358,7 @@ def test_a_robot_below_the_ground_is_refused() -> None:
 
 def test_an_unstable_simulation_is_refused(flat: Simulation) -> None:
     start = neutral_state(ROBOT, 50.0)
-    flat.reset(replace(start, bar_velocities=start.bar_velocities + 80.0))
+    flat.reset(start.but(bar_velocities=start.bar_velocities + 80.0))
     with pytest.raises(PhysicsError, match="became unstable"):
         flat.control_step(np.full(CABLES_N, 1.0))
 
@@ -369,7 +367,7 @@ def test_a_robot_beyond_the_side_of_the_ground_is_refused() -> None:
     with Simulation(ROBOT) as simulation:
         simulation.set_ground(generate(0, 0.5, 10.0))
         start = neutral_state(ROBOT, 1.6)
-        simulation.reset(replace(start, bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
+        simulation.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
         with pytest.raises(PhysicsError, match="beyond the ground's side at 5"):
             simulation.control_step(np.full(CABLES_N, 1.0))
 

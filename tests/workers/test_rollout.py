@@ -120,7 +120,7 @@ def test_canonical_columns_map_back_to_the_world(flat: Episode) -> None:
     canonical = schema.array(frames, "nodes").reshape(rows, 12, 3)
     back = np.take_along_axis(canonical @ maps, NODE_MAP[element][:, :, None], axis=1) + com[:, None]
     bars = [schema.array(frames, name) for name in schema.FRAMES.names if name.startswith("bar_")]
-    state = RobotState(*(b.reshape(rows, 6, -1).astype(float) for b in bars), np.zeros((rows, 24)))
+    state = RobotState.of(*(b.reshape(rows, 6, -1).astype(float) for b in bars), np.zeros((rows, 24)))
     assert np.abs(back - state.nodes()).max() < 1e-5
     again = canonical_vectors(back - com[:, None], maps, NODES_FROM[element])
     assert np.abs(again - canonical).max() < 1e-5
@@ -197,10 +197,11 @@ def test_a_policy_that_does_not_fit_is_refused(worker: RolloutWorker) -> None:
 
 
 def test_exploration_noise_has_its_spread_and_correlation() -> None:
-    samples = np.array(list(noise(np.random.default_rng(0), 0.15, 0.6, 4000)))
-    assert len(samples) == 4000
+    samples = noise(np.random.default_rng(0), 0.15, 0.6, 4000)
+    assert samples.shape == (4000, 24)
     assert samples.std() == pytest.approx(0.15, rel=0.02)
-    assert np.mean(samples[1:] * samples[:-1]) / samples.var() == pytest.approx(0.6, abs=0.02)
+    for lag in (1, 3):
+        assert np.mean(samples[lag:] * samples[:-lag]) / samples.var() == pytest.approx(0.6**lag, abs=0.02)
 
 
 def test_waypoints_form_a_chain_within_the_area() -> None:

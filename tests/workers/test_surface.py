@@ -1,6 +1,5 @@
 """Laws of grounds from files, inclines and fences."""
 
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -109,7 +108,7 @@ def test_a_robot_thrown_at_the_fence_stays_inside() -> None:
     with Simulation(robot) as simulation:
         for direction in ([2.0, 0.0, 0.0], [-2.0, 2.0, 0.0]):
             simulation.set_ground(terrain)
-            start = replace(neutral_state(robot), bar_velocities=np.tile(direction, (6, 1)))
+            start = neutral_state(robot).but(bar_velocities=np.tile(direction, (6, 1)))
             simulation.reset(start)
             for _ in range(60):
                 state = simulation.control_step(start.rest_lengths)

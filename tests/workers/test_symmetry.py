@@ -102,7 +102,7 @@ def _random_state(rng: np.random.Generator) -> RobotState:
     # The shortest turn from z to the axis, followed by a random spin about it.
     shortest = np.column_stack([-axes[:, 1], axes[:, 0], np.zeros(6), 1 + axes[:, 2]])
     shortest /= np.linalg.norm(shortest, axis=1, keepdims=True)
-    return RobotState(
+    return RobotState.of(
         (nodes[0::2] + nodes[1::2]) / 2,
         shortest,
         rng.standard_normal((6, 3)),
@@ -119,7 +119,7 @@ def _copy(state: RobotState, element: int, yaw: float) -> RobotState:
     nodes = (state.nodes() @ world.T)[NODES_FROM[element]]
     axes = (nodes[0::2] - nodes[1::2]) / BAR_LENGTH_M
     quaternions = np.column_stack([-axes[:, 1], axes[:, 0], np.zeros(6), 1 + axes[:, 2]])
-    return RobotState(
+    return RobotState.of(
         (state.bar_positions @ world.T)[bars],
         quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
         (state.bar_velocities @ world.T)[bars],

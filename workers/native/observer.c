@@ -10,6 +10,7 @@
 #include <string.h>
 
 enum { BARS = 6, NODES = 12, CABLES = 24, FACES = 20, ELEMENTS = 24, SENSORS = 47, OBSERVATION = SENSORS + 3 * NODES };
+enum { POSITION = 0, ORIENTATION = 3, VELOCITY = 7, ANGULAR_VELOCITY = 10, NUMBERS = 13 }; /* of a bar, as RobotState.bars */
 enum { ANY = -1 }; /* rows and columns of a square of any size */
 
 static struct {
@@ -20,7 +21,7 @@ static struct {
     double bar_length, rest_length_scale, angular_velocity_scale, slowest_track, node_scale, farthest_node;
 } tables;
 
-/* A view of a buffer of doubles [rows, 3 or 4] or [n], whatever its strides. */
+/* A view of a buffer of doubles [rows, columns] or [n], whatever its strides. */
 struct view {
     Py_buffer buffer;
     Py_ssize_t row, column;
@@ -48,23 +49,24 @@ static int open_view(PyObject *object, struct view *view, Py_ssize_t rows, Py_ss
     return 0;
 }
 
-static void find_nodes(const struct view *positions, const struct view *orientations, double nodes[NODES][3]) {
+static void find_nodes(const struct view *bars, double nodes[NODES][3]) {
     for (int bar = 0; bar < BARS; bar++) {
-        const double x = at(orientations, bar, 0), y = at(orientations, bar, 1);
-        const double z = at(orientations, bar, 2), w = at(orientations, bar, 3);
+        const double x = at(bars, bar, ORIENTATION), y = at(bars, bar, ORIENTATION + 1);
+        const double z = at(bars, bar, ORIENTATION + 2), w = at(bars, bar, ORIENTATION + 3);
         const double arm[3] = {(x * z + w * y) * tables.bar_length, (y * z - w * x) * tables.bar_length,
                                (0.5 - x * x - y * y) * tables.bar_length};
         for (int i = 0; i < 3; i++) {
-            nodes[2 * bar][i] = at(positions, bar, i) + arm[i];
-            nodes[2 * bar + 1][i] = at(positions, bar, i) - arm[i];
+            nodes[2 * bar][i] = at(bars, bar, POSITION + i) + arm[i];
+            nodes[2 * bar + 1][i] = at(bars, bar, POSITION + i) - arm[i];
         }
     }
 }
 
-static void mean_row(const struct view *rows, double mean[3]) {
+/* Mean over the bars of three of their numbers. */
+static void mean_of(const struct view *bars, int first, double mean[3]) {
     for (int i = 0; i < 3; i++) {
         mean[i] = 0;
-        for (int bar = 0; bar < BARS; bar++) mean[i] += at(rows, bar, i);
+        for (int bar = 0; bar < BARS; bar++) mean[i] += at(bars, bar, first + i);
         mean[i] /= BARS;
     }
 }
@@ -112,21 +114,15 @@ static double frame_yaw(double nodes[NODES][3], int face, int element) {
     return atan2(twist, along);
 }
 
-/* survey(positions [6, 3], orientations [6, 4]) -> (face, com x, com y, com z) */
-static PyObject *survey(PyObject *self, PyObject *const *arguments, Py_ssize_t n) {
+/* survey(bars [6, 13]) -> (face, com x, com y, com z) */
+static PyObject *survey(PyObject *self, PyObject *argument) {
     (void)self;
-    struct view positions, orientations;
-    if (n != 2) return PyErr_Format(PyExc_TypeError, "survey takes 2 arguments");
-    if (open_view(arguments[0], &positions, BARS, 3) != 0) return NULL;
-    if (open_view(arguments[1], &orientations, BARS, 4) != 0) {
-        PyBuffer_Release(&positions.buffer);
-        return NULL;
-    }
+    struct view bars;
+    if (open_view(argument, &bars, BARS, NUMBERS) != 0) return NULL;
     double nodes[NODES][3], com[3];
-    find_nodes(&positions, &orientations, nodes);
-    mean_row(&positions, com);
-    PyBuffer_Release(&positions.buffer);
-    PyBuffer_Release(&orientations.buffer);
+    find_nodes(&bars, nodes);
+    mean_of(&bars, POSITION, com);
+    PyBuffer_Release(&bars.buffer);
     return Py_BuildValue("iddd", support_face(nodes, com), com[0], com[1], com[2]);
 }
 
@@ -141,29 +137,26 @@ static double ground_height(const struct view *heights, double cell, double x, d
                   : corner + b * (turning - corner) + a * (far - turning);
 }
 
-/* extremes(positions [6, 3], orientations [6, 4], heights [n, n], cell) -> (largest |x| or |y|, largest depth) of nodes */
+/* extremes(bars [6, 13], heights [n, n], cell) -> (largest |x| or |y|, largest depth) of nodes */
 static PyObject *extremes(PyObject *self, PyObject *const *arguments, Py_ssize_t n) {
     (void)self;
-    static const Py_ssize_t columns[3] = {3, 4, ANY};
-    struct view views[3];
+    struct view bars, heights;
+    if (n != 3) return PyErr_Format(PyExc_TypeError, "extremes takes 3 arguments");
+    const double cell = PyFloat_AsDouble(arguments[2]);
+    if (PyErr_Occurred() || open_view(arguments[0], &bars, BARS, NUMBERS) != 0) return NULL;
     PyObject *result = NULL;
-    int opened = 0;
-    if (n != 4) return PyErr_Format(PyExc_TypeError, "extremes takes 4 arguments");
-    const double cell = PyFloat_AsDouble(arguments[3]);
-    if (PyErr_Occurred()) return NULL;
-    while (opened < 3 && open_view(arguments[opened], &views[opened], opened < 2 ? BARS : ANY, columns[opened]) == 0)
-        opened++;
-    if (opened == 3) {
+    if (open_view(arguments[1], &heights, ANY, ANY) == 0) {
         double nodes[NODES][3], side = 0, depth = -INFINITY;
-        find_nodes(&views[0], &views[1], nodes);
+        find_nodes(&bars, nodes);
         for (int node = 0; node < NODES; node++) {
             const double *at_node = nodes[node];
             side = fmax(side, fmax(fabs(at_node[0]), fabs(at_node[1])));
-            depth = fmax(depth, ground_height(&views[2], cell, at_node[0], at_node[1]) - at_node[2]);
+            depth = fmax(depth, ground_height(&heights, cell, at_node[0], at_node[1]) - at_node[2]);
         }
         result = Py_BuildValue("dd", side, depth);
+        PyBuffer_Release(&heights.buffer);
     }
-    while (opened > 0) PyBuffer_Release(&views[--opened].buffer);
+    PyBuffer_Release(&bars.buffer);
     return result;
 }
 
@@ -175,43 +168,41 @@ static void put_direction(float *out, double yaw, double side, double x, double 
 }
 
 /*
- * observe(positions, orientations, velocities [6, 3], angular velocities [6, 3], rest lengths [24], face, element,
- *         target x, target y, nominal rest length, out: writable float32 [83]) -> yaw
+ * observe(bars [6, 13], rest lengths [24], face, element, target x, target y, nominal rest length,
+ *         out: writable float32 [83]) -> yaw
  */
 static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n) {
     (void)self;
-    if (n != 11) return PyErr_Format(PyExc_TypeError, "observe takes 11 arguments");
-    const long face = PyLong_AsLong(objects[5]), element = PyLong_AsLong(objects[6]);
-    const double target[2] = {PyFloat_AsDouble(objects[7]), PyFloat_AsDouble(objects[8])};
-    const double nominal = PyFloat_AsDouble(objects[9]);
-    if (PyErr_Occurred()) return NULL;
-    static const Py_ssize_t rows[5] = {BARS, BARS, BARS, BARS, CABLES}, columns[5] = {3, 4, 3, 3, 1};
-    struct view views[5];
+    if (n != 8) return PyErr_Format(PyExc_TypeError, "observe takes 8 arguments");
+    const long face = PyLong_AsLong(objects[2]), element = PyLong_AsLong(objects[3]);
+    const double target[2] = {PyFloat_AsDouble(objects[4]), PyFloat_AsDouble(objects[5])};
+    const double nominal = PyFloat_AsDouble(objects[6]);
+    struct view bars, rest_lengths;
     Py_buffer out_buffer;
     PyObject *result = NULL;
-    int opened = 0;
-    while (opened < 5 && open_view(objects[opened], &views[opened], rows[opened], columns[opened]) == 0) opened++;
-    if (opened < 5 || PyObject_GetBuffer(objects[10], &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) != 0) goto release;
+    if (PyErr_Occurred() || open_view(objects[0], &bars, BARS, NUMBERS) != 0) return NULL;
+    if (open_view(objects[1], &rest_lengths, CABLES, 1) != 0) goto release_bars;
+    if (PyObject_GetBuffer(objects[7], &out_buffer, PyBUF_CONTIG | PyBUF_FORMAT) != 0) goto release_rest_lengths;
     const int fits = out_buffer.len == OBSERVATION * (Py_ssize_t)sizeof(float) && strcmp(out_buffer.format, "f") == 0;
     if (!fits || face < 0 || face >= FACES || element < 0 || element >= ELEMENTS) {
         PyErr_SetString(PyExc_ValueError, "observe: face, element or output out of range");
     } else {
         double nodes[NODES][3], com[3], velocity[3];
-        find_nodes(&views[0], &views[1], nodes);
-        mean_row(&views[0], com);
-        mean_row(&views[2], velocity);
+        find_nodes(&bars, nodes);
+        mean_of(&bars, POSITION, com);
+        mean_of(&bars, VELOCITY, velocity);
         const double yaw = frame_yaw(nodes, (int)face, (int)element), side = tables.proper[element] ? 1.0 : -1.0;
         const double c = cos(yaw), s = sin(yaw);
         float *out = out_buffer.buf;
         out[0] = (float)tables.kinds[face];
         for (int cable = 0; cable < CABLES; cable++)
             out[1 + cable] =
-                (float)((at(&views[4], (int)tables.cables_from[element][cable], 0) - nominal) / tables.rest_length_scale);
+                (float)((at(&rest_lengths, (int)tables.cables_from[element][cable], 0) - nominal) / tables.rest_length_scale);
         for (int bar = 0; bar < BARS; bar++) { /* a mirror maps the pseudo-vector by det(W) W */
             const int from = (int)tables.bars_from[element][bar];
-            const double x = at(&views[3], from, 0) / tables.angular_velocity_scale;
-            const double y = at(&views[3], from, 1) / tables.angular_velocity_scale;
-            const double z = at(&views[3], from, 2) / tables.angular_velocity_scale;
+            const double x = at(&bars, from, ANGULAR_VELOCITY) / tables.angular_velocity_scale;
+            const double y = at(&bars, from, ANGULAR_VELOCITY + 1) / tables.angular_velocity_scale;
+            const double z = at(&bars, from, ANGULAR_VELOCITY + 2) / tables.angular_velocity_scale;
             out[25 + 3 * bar] = (float)(side * c * x - s * y);
             out[26 + 3 * bar] = (float)(side * s * x + c * y);
             out[27 + 3 * bar] = (float)(side * z);
@@ -229,8 +220,10 @@ static PyObject *observe(PyObject *self, PyObject *const *objects, Py_ssize_t n)
         result = PyFloat_FromDouble(yaw);
     }
     PyBuffer_Release(&out_buffer);
-release:
-    while (opened > 0) PyBuffer_Release(&views[--opened].buffer);
+release_rest_lengths:
+    PyBuffer_Release(&rest_lengths.buffer);
+release_bars:
+    PyBuffer_Release(&bars.buffer);
     return result;
 }
 
@@ -288,7 +281,7 @@ static PyObject *bind(PyObject *self, PyObject *bytes) {
 
 static PyMethodDef methods[] = {
     {"bind", bind, METH_O, "Take the tables of topology and symmetry."},
-    {"survey", (PyCFunction)(void (*)(void))survey, METH_FASTCALL, "Support face and centre of mass of a state."},
+    {"survey", survey, METH_O, "Support face and centre of mass of a state."},
     {"extremes", (PyCFunction)(void (*)(void))extremes, METH_FASTCALL, "Farthest side and largest depth of the nodes."},
     {"observe", (PyCFunction)(void (*)(void))observe, METH_FASTCALL, "Write the observation of a state; returns the turn of its frame."},
     {"steer", (PyCFunction)(void (*)(void))steer, METH_FASTCALL, "Write mean, command and action of a control step."},
