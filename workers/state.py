@@ -45,8 +45,12 @@ class RobotState:
 
     def but(self, **parts: Array) -> RobotState:
         """This state with other `parts`, named as the arguments of `of`."""
+        return RobotState.of(**(self.parts() | parts))
+
+    def parts(self) -> dict[str, Array]:
+        """The arguments of `of` by name."""
         names = ("bar_positions", "bar_orientations", "bar_velocities", "bar_angular_velocities", "rest_lengths")
-        return RobotState.of(**({name: getattr(self, name) for name in names} | parts))
+        return {name: getattr(self, name) for name in names}
 
     @property
     def bar_positions(self) -> Array:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import asdict
 from typing import Any
 
 import numpy as np
@@ -53,7 +52,7 @@ class RolloutWorker:
         """Control step of the newest episode, and its last states: where it stands, or where it failed."""
         states = self._record.states[-LAST_STATES_N:]
         return len(self._record.actions), [
-            {name: values.tolist() for name, values in asdict(state).items()} for state in states
+            {name: values.tolist() for name, values in state.parts().items()} for state in states
         ]
 
     def close(self) -> None:
