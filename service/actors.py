@@ -5,7 +5,6 @@ Ray restarts nothing: `pool` replaces workers, the transport replaces the holder
 
 from __future__ import annotations
 
-import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -105,7 +104,6 @@ class RayExecutor(Executor):
         self._learner: Any = None
         self._newest: tuple[Episode, Any] | None = None  # an episode and the reference to its frames
         self._keep: Callable[[Episode], None] | None = None  # while the workers sample ahead
-        self._tended_s = -math.inf
         self._tend()
 
     def sample(
@@ -201,10 +199,9 @@ class RayExecutor(Executor):
 
     def _tend(self) -> None:
         """Let the pool work, but not all the time, and keep what was sampled ahead."""
-        if time.monotonic() - self._tended_s < control.TICK_S:
+        if time.monotonic() - self.pool.ticked_s < control.TICK_S:
             return
         self.pool.tick()
-        self._tended_s = time.monotonic()
         if self._keep is not None:
             for episode, _ in self.pool.arrived():
                 self._keep(episode)

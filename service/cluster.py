@@ -51,6 +51,7 @@ def join_or_start(config: Config) -> int:
         object_store_memory=OBJECT_STORE_BYTES,
         _node_ip_address="127.0.0.1",
     )
+    ray_worker._global_node.kill_log_monitor()  # type: ignore[attr-defined]  # nobody reads what it forwards
     return int(cpus_n / each + 1e-6)
 
 

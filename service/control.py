@@ -27,6 +27,7 @@ class Control:
 
     def __init__(self, run: Run | None, workers_most: int) -> None:
         self._run, self._most = run, workers_most
+        self._wish_path = None if run is None else run.pool / "wish.json"
         self._published_s, self._state, self._wrote_n = -PUBLISH_S, "", 0
         self._seen = self._changed()  # a wish for a process that has ended since
         self._wish_id: str | None = None
@@ -34,10 +35,10 @@ class Control:
     def wish(self) -> int | None:
         """The number of workers that is newly wished for, None when nothing new is."""
         changed = self._changed()
-        if self._run is None or changed == self._seen:
+        if self._wish_path is None or changed == self._seen:
             return None
         self._seen = changed
-        wish = json.loads((self._run.pool / "wish.json").read_text())
+        wish = json.loads(self._wish_path.read_text())
         self._wish_id, self._state = wish["id"], ""  # answered at once
         return min(max(int(wish["workers"]), 0), self._most)
 
@@ -56,14 +57,14 @@ class Control:
         path.parent.mkdir(exist_ok=True)
         known = {"time_s": time.time(), "pid": os.getpid(), "wish": self._wish_id, "most": self._most}
         draft = durable.hidden(path)
-        draft.write_text(json.dumps(known | status, indent=1) + "\n")
+        draft.write_text(json.dumps(known | status) + "\n")
         draft.replace(path)
 
     def _changed(self) -> int | None:
-        if self._run is None:
+        if self._wish_path is None:
             return None
         try:
-            return (self._run.pool / "wish.json").stat().st_mtime_ns
+            return self._wish_path.stat().st_mtime_ns
         except FileNotFoundError:
             return None
 

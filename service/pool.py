@@ -44,6 +44,8 @@ class Pool:
 
     expected_settings_digest    every worker must have the settings that this stands for
     quarantine                  keeps a crash bundle; called with a plan whose last attempt has failed
+
+    ticked_s    when the last round began (s, `clock`)
     """
 
     def __init__(
@@ -63,6 +65,7 @@ class Pool:
         self.phase = "starting"
         self._policy_digests: dict[int, str] = {}
         self.workers: dict[int, Worker] = {}
+        self.ticked_s = -math.inf
         self.counters = {"started": 0, "crashed": 0, "hung": 0, "drained": 0}
         self._transport = transport
         self._digest = expected_settings_digest
@@ -89,7 +92,7 @@ class Pool:
         """
         for report in self._transport.poll(0.0):
             self._hear(report)
-        now = self._clock()
+        now = self.ticked_s = self._clock()
         self._scale(now)
         self._replace_hung(now)
         self._drain(now)

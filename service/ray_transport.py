@@ -34,7 +34,7 @@ MakeWorker = Callable[[RolloutSettings], Runner]
 PULL_DEADLINE_S = 10.0
 EXAMINE_DEADLINE_S = 0.6
 """A caretaker that has not answered by then is cut off, and its node with it."""
-HOLDER_PING_S, HOLDER_START_S = 0.5, 60.0
+HOLDER_PING_S, HOLDER_START_S = 1.0, 60.0
 """How often the holder is asked for a sign of life, and how long its process may take to start and give one."""
 VERSIONS_HELD_N = 2
 _log = logging.getLogger(__name__)
@@ -80,6 +80,7 @@ class WorkerActor:
     def ping(self) -> None:
         """A sign of life."""
 
+    @ray.method(num_returns=3)
     def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Buffer | Failure | None, pa.Buffer | None, str]:
         """Summary, frames and the policy's digest; a Failure, or None without the policy, in the summary's place."""
         if self._worker is None:
@@ -184,7 +185,7 @@ class RayTransport(Transport):
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        self._expect(handle, plan, handle.actor.run.options(num_returns=3).remote(plan, self._holder))
+        self._expect(handle, plan, handle.actor.run.remote(plan, self._holder))
 
     def _expect(self, handle: Remote, plan: EpisodePlan, answer: Sequence[Any]) -> None:
         """Of the three parts of an answer the frames alone travel: it counts as come when they are on this node."""
@@ -196,12 +197,16 @@ class RayTransport(Transport):
 
     def poll(self, wait_s: float) -> list[Report]:
         self._watch_holder()
-        if not self._asked:
+        awaited = [*self._asked, *([] if self._holder_pong is None else [self._holder_pong])]
+        if not awaited:
             time.sleep(wait_s)
             return []
-        found, _ = ray.wait(list(self._asked), num_returns=1, timeout=wait_s)
+        found, _ = ray.wait(awaited, num_returns=1, timeout=wait_s)
         if found:
-            found, _ = ray.wait(list(self._asked), num_returns=len(self._asked), timeout=0)
+            found, _ = ray.wait(awaited, num_returns=len(awaited), timeout=0)
+        if self._holder_pong in found:
+            found.remove(self._holder_pong)
+            self._hear_holder()
         return [self._report(reference, *self._asked.pop(reference)) for reference in found]
 
     def _report(self, reference: Any, remote: Remote, plan: EpisodePlan | None, what: Any) -> Report:
@@ -268,15 +273,14 @@ class RayTransport(Transport):
         if self._holder_pong is None:
             if now - self._holder_pinged_s >= HOLDER_PING_S:
                 self._holder_pong, self._holder_pinged_s = self._holder.ping.remote(), now
-            return
-        answered, _ = ray.wait([self._holder_pong], timeout=0)
-        if answered:
-            try:
-                ray.get(self._holder_pong)
-                self._holder_pong = None
-            except ray.exceptions.RayError:
-                self._replace_holder()
         elif now - self._holder_pinged_s > HOLDER_START_S:
+            self._replace_holder()
+
+    def _hear_holder(self) -> None:
+        try:
+            ray.get(self._holder_pong)
+            self._holder_pong = None
+        except ray.exceptions.RayError:
             self._replace_holder()
 
     def _replace_holder(self) -> None:
