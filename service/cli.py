@@ -33,7 +33,7 @@ from t6gps.storage.errors import ConfigError, RunError, T6GpsError
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
-EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "run.steps", "run.workers")
+EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
 EXPORT_SECTIONS = ("robot.", "terrain.")
 
 Overrides = Annotated[

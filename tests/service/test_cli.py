@@ -62,8 +62,9 @@ def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
 def test_eval_changes_the_world_but_not_the_policy(root: Path) -> None:
     arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json")
     usual = json.loads(t6gps(*arguments, root=root).stdout)
-    rough = json.loads(t6gps(*arguments, "--set", "terrain.difficulty=0.5", root=root).stdout)
-    assert usual["cost"] != rough["cost"]
+    for change in ("terrain.difficulty=0.5", "randomisation.sensor_noise=0.3"):
+        changed = json.loads(t6gps(*arguments, "--set", change, root=root).stdout)
+        assert usual["cost"] != changed["cost"]
     refused = t6gps(*arguments, "--set", "learner.kl_weight=1", root=root, code=2)
     assert b"eval cannot change learner.kl_weight" in refused.stderr
 
