@@ -22,7 +22,7 @@ def test_the_presets_of_the_paper_have_its_sizes() -> None:
         "rough-quick",
     ]
     rough, flat = load("rough"), load("flat")
-    assert (rough.run.episodes, rough.run.steps, rough.run.iterations) == (300, 250, 5)
+    assert (rough.run.episodes, rough.run.steps, rough.run.iterations) == (100, 250, 15)
     assert rough.terrain.difficulty == 1.0
     assert flat.run.episodes * flat.run.steps * flat.run.iterations == 125_000
     assert flat.terrain.difficulty == 0.0
