@@ -15,3 +15,6 @@ if "RAY_ADDRESS" not in os.environ:
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     # Ray would run the workers at the lowest priority but four: on a busy machine they hardly start.
     os.environ.setdefault("RAY_worker_niceness", "0")
+    # Processes that fit models wait for the next iteration. Ray would end them after a second, and a new one takes
+    # longer to start than the fits take.
+    os.environ.setdefault("RAY_idle_worker_killing_time_threshold_ms", "300000")

@@ -24,9 +24,6 @@ from t6gps.storage.errors import RunError
 OBJECT_STORE_BYTES = 2 * 1024**3
 CONNECT_DEADLINE_S = 10.0
 """How long the head of a cluster has to answer."""
-FITTERS_KEPT_S = 300
-"""How long processes that fit models wait for the next iteration: longer than it takes to sample one. By default Ray
-ends them after a second, and a new one takes longer to start than the fits of an iteration."""
 SPREAD = "SPREAD"
 _log = logging.getLogger(__name__)
 
@@ -53,7 +50,6 @@ def join_or_start(config: Config) -> int:
         include_dashboard=False,
         object_store_memory=OBJECT_STORE_BYTES,
         _node_ip_address="127.0.0.1",
-        _system_config={"idle_worker_killing_time_threshold_ms": 1000 * FITTERS_KEPT_S},
     )
     ray_worker._global_node.kill_log_monitor()  # type: ignore[attr-defined]  # nobody reads what it forwards
     return int(cpus_n / each + 1e-6)
