@@ -27,6 +27,9 @@ from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.worker import RolloutWorker
 
+ADDED_AT_ONCE_N = 8
+"""Episodes that the learner gets with one call: a call costs both processes as much as everything else about them."""
+
 
 class LearnerActor:
     """The learner; its fits run as tasks beside it."""
@@ -36,8 +39,9 @@ class LearnerActor:
 
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
 
-    def add(self, frames: pa.Buffer) -> None:
-        self._learner.add(ipc.unpack(frames))
+    def add(self, *episodes: pa.Buffer) -> None:
+        for frames in episodes:
+            self._learner.add(ipc.unpack(frames))
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         yield from getattr(self._learner, phase)()
@@ -103,6 +107,7 @@ class RayExecutor(Executor):
         )
         self._learner: Any = None
         self._newest: tuple[Episode, Any] | None = None  # an episode and the reference to its frames
+        self._handed: list[tuple[Episode, Any]] = []  # the same of those that the learner has not been told of
         self._keep: Callable[[Episode], None] | None = None  # while the workers sample ahead
         self._tend()
 
@@ -140,9 +145,17 @@ class RayExecutor(Executor):
             frames = self._newest[1]  # just sampled: they are in the object store already
         else:
             frames = ipc.pack(episode.frames)
-        self._answer(self._of_learner.add.remote(frames))
+        self._handed.append((episode, frames))
+        if len(self._handed) == ADDED_AT_ONCE_N:
+            self._hand_over()
+
+    def _hand_over(self) -> None:
+        handed, self._handed = self._handed, []
+        if handed:
+            self._answer(self._of_learner.add.remote(*(frames for _, frames in handed)))
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
+        self._hand_over()
         self.pool.phase = phase
         steps = self._of_learner.learn.options(num_returns="streaming").remote(phase)
         while True:
@@ -154,12 +167,13 @@ class RayExecutor(Executor):
             yield self._answer(step)
 
     def ask(self, method: str, *arguments: Any) -> Any:
+        self._hand_over()
         return self._answer(self._of_learner.ask.remote(method, *arguments))
 
     def replace_learner(self) -> None:
         if self._learner is not None:
             ray.kill(self._learner)
-        self._learner = None
+        self._learner, self._handed = None, []
 
     def close(self) -> None:
         if not ray.is_initialized():
