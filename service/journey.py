@@ -54,6 +54,11 @@ HIGH_CLIMB_M = 2 / 3 * BAR_LENGTH_M
 MOVING_M_PER_S = 0.2
 BINS_N = 12
 SNAPSHOTS_N = 6
+GRADE_DEG, GRADES_DEG = 5.0, 35.0
+"""Width of a bin of slopes, and the steepest of them."""
+FEWEST_STEPS_N = 100
+"""A bin with fewer rows has no mean worth drawing."""
+SLOPE_POINTS_N = 7
 FOOTPRINT_MARGIN_M = 1.2
 
 
@@ -203,6 +208,63 @@ def any_axis(finished: Sequence[Finished]) -> Figure:
         lambda_.set_xlabel("direction from the axis of the triangle (°)")
         _crossings(edges, counts)
     return figure
+
+
+def grades(finished: Sequence[Finished]) -> Figure:
+    """Speed towards the waypoint by how steeply the ground rises on the way there, in the runs of the first arm.
+
+    The rise is that of the plane which fits the ground within half a bar of the centre of mass best.
+    """
+    finished = [one for one in finished if one.trial.arm == finished[0].trial.arm]
+    angle_deg, speed = (np.concatenate(part) for part in zip(*map(_rises, finished), strict=True))
+    bounds = np.arange(-GRADES_DEG, GRADES_DEG + 1, GRADE_DEG)
+    inside, middles = (np.abs(angle_deg) < GRADES_DEG), (bounds[1:] + bounds[:-1]) / 2
+    counts, _ = np.histogram(angle_deg[inside], bounds)
+    sums, _ = np.histogram(angle_deg[inside], bounds, weights=speed[inside])
+    shown = counts >= FEWEST_STEPS_N
+    with rc_context(STYLE):
+        figure = canvas(7, 3.8)
+        axes = figure.subplots()
+        axes.bar(middles, 100 * counts / len(speed), width=GRADE_DEG, color=GREY, alpha=0.5, edgecolor="white")
+        axes.set(xlabel="rise of the ground towards the waypoint (°)", ylabel="share of the time (%)")
+        axes.grid(visible=False)
+        speeds = axes.twinx()
+        speeds.plot(middles[shown], sums[shown] / counts[shown], color=BLUE, marker="o", markersize=4.5)
+        speeds.set_ylabel("towards the waypoint (m/s)", color=BLUE)
+        speeds.set_ylim(bottom=min(0.0, speeds.get_ylim()[0]))
+        uphill = angle_deg > GRADE_DEG
+        if uphill.any() and not uphill.all():
+            share, up, other = uphill.mean(), speed[uphill].mean(), speed[~uphill].mean()
+            axes.set_title(
+                f"{share:.0%} of the time uphill by {GRADE_DEG:.0f}° or more: {up:.2f} m/s; else {other:.2f}"
+            )
+    return figure
+
+
+def _rises(one: Finished) -> tuple[Array, Array]:
+    """Rise of the ground towards the waypoint (deg) and speed towards it (m/s) in the rows of the last iteration."""
+    newest = "iteration = (SELECT max(iteration) FROM frames)"
+    columns = "episode_id, com_x_m, com_y_m, waypoint_x_m, waypoint_y_m, forward_speed_m_per_s"
+    rows = query(one.run, f"SELECT {columns} FROM frames WHERE {newest} ORDER BY episode_id, step")
+    place = np.column_stack([numbers(rows, "com_x_m"), numbers(rows, "com_y_m")])
+    ahead = np.column_stack([numbers(rows, "waypoint_x_m"), numbers(rows, "waypoint_y_m")]) - place
+    ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
+    episode, rises = numbers(rows, "episode_id"), np.zeros(len(place))
+    for row in tables.read(one.run, "episodes", filter=pc.field("episode_id").isin(np.unique(episode))).to_pylist():
+        terrain = ground(one.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+        chosen = episode == row["episode_id"]
+        if terrain is not None:
+            rises[chosen] = (slope(terrain, place[chosen]) * ahead[chosen]).sum(axis=1)
+    return np.degrees(np.arctan(rises)), numbers(rows, "forward_speed_m_per_s")
+
+
+def slope(terrain: Terrain, place: Array) -> Array:
+    """Gradient [n, 2] of the plane that fits the ground within half a bar of each place [n, 2] (m) best, by x and y."""
+    steps = np.linspace(-BAR_LENGTH_M / 2, BAR_LENGTH_M / 2, SLOPE_POINTS_N)
+    around = np.stack(np.meshgrid(steps, steps), axis=-1).reshape(-1, 2)
+    heights = terrain.height(*np.moveaxis(place[:, None] + around, 2, 0))
+    gradient: Array = heights @ around / (around[:, 0] @ around[:, 0])
+    return gradient
 
 
 ORDER = ("kind", "entry_edge", "exit_edge")

@@ -195,7 +195,7 @@ STUDIES = {
         arms={"nodes": ROUGH},
         quick=("run.episodes=60",),
         quick_seeds=3,
-        figures=("ground_track", "footprints", "climb", "climbs", "any_axis"),
+        figures=("ground_track", "footprints", "climb", "climbs", "any_axis", "grades"),
     ),
     "flat": Study(
         question=(

@@ -189,5 +189,6 @@ FIGURES: dict[str, Callable[[Sequence[Finished]], Figure]] = {
     "climb": journey.climb,
     "climbs": journey.climbs,
     "any_axis": journey.any_axis,
+    "grades": journey.grades,
 }
 """Every study has the first two; a study names the others it wants."""

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from t6gps.service import config, evaluation, launch, peers, studies, study, study_figures, study_report
+from t6gps.service import config, evaluation, journey, launch, peers, studies, study, study_figures, study_report
 from t6gps.service.serial import new_learner
 from t6gps.service.studies import PAPER, STUDIES, Arm, Peer, Scale, Study
 from t6gps.service.study import Finished, Trial
@@ -19,6 +19,8 @@ from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers import policy
+from t6gps.workers.ground import tilted
+from t6gps.workers.terrain import Terrain
 
 TINY = (
     "run.iterations=1",
@@ -37,7 +39,16 @@ PAIR = Study(
     },
     quick=TINY,
     quick_seeds=1,
-    figures=("speed_distribution", "modes_per_class", "ground_track", "footprints", "climbs", "any_axis", "conditions"),
+    figures=(
+        "speed_distribution",
+        "modes_per_class",
+        "ground_track",
+        "footprints",
+        "climbs",
+        "any_axis",
+        "grades",
+        "conditions",
+    ),
     conditions={"tilted": ("terrain.tilt_deg=20",)},
 )
 
@@ -245,3 +256,9 @@ def test_every_arm_is_drawn(pair: tuple[Path, list[Finished]]) -> None:
     legend = study_figures.learning(many).get_axes()[0].get_legend()
     assert legend is not None
     assert [text.get_text() for text in legend.get_texts()] == labels
+
+
+def test_the_slope_of_a_tilted_plane_is_its_tilt() -> None:
+    plane = tilted(Terrain(np.zeros((401, 401)), 0.1), 20.0)
+    place = np.array([[0.0, 0.0], [5.0, -3.0]])
+    np.testing.assert_allclose(journey.slope(plane, place), [[np.tan(np.radians(20.0)), 0.0]] * 2, atol=1e-12)
