@@ -1,6 +1,6 @@
 """How a trained robot crosses its ground: tracks, footprints, climbs and directions, from stored episodes by query.
 
-The episodes are those of the last iteration, so the newest policy but one acted in them, with exploration noise.
+The episodes are those of the last third of the iterations, with exploration noise.
 """
 
 from __future__ import annotations
@@ -30,11 +30,14 @@ from t6gps.workers.topology import BAR_LENGTH_M, DELTA, FACES, LAMBDA
 
 Array = NDArray[np.float64]
 
-LARGEST_CLIMBS = """
+LATE = "3 * (iteration + 1) > 2 * (SELECT max(iteration) + 1 FROM frames)"
+"""Rows of the last third of the iterations."""
+
+LARGEST_CLIMBS = f"""
     WITH smooth AS (
         SELECT episode_id, step, avg(com_z_m) OVER (
             PARTITION BY episode_id ORDER BY step ROWS BETWEEN 5 PRECEDING AND 5 FOLLOWING) AS height_m
-        FROM frames WHERE iteration = (SELECT max(iteration) FROM frames)),
+        FROM frames WHERE {LATE}),
     climbed AS (
         SELECT episode_id, step, height_m - min(height_m) OVER (PARTITION BY episode_id ORDER BY step) AS gain_m
         FROM smooth)
@@ -44,9 +47,9 @@ LARGEST_CLIMBS = """
 """The largest height gain of the centre of mass in each episode, over running means of 1.1 s, so that neither the
 pumping of the shape nor a bump of a single step counts."""
 
-TRANSITIONS = """
+TRANSITIONS = f"""
     SELECT kind, entry_edge, exit_edge, count(*) AS transitions FROM frames
-    WHERE exit_edge IS NOT NULL AND entry_edge IS NOT NULL AND iteration = (SELECT max(iteration) FROM frames)
+    WHERE exit_edge IS NOT NULL AND entry_edge IS NOT NULL AND {LATE}
     GROUP BY ALL ORDER BY ALL
 """
 HIGH_CLIMB_M = 2 / 3 * BAR_LENGTH_M
@@ -189,8 +192,7 @@ def any_axis(finished: Sequence[Finished]) -> Figure:
     entropy over that of equal shares, 1 for motion along any axis and 0 along a single one.
     """
     finished = [one for one in finished if one.trial.arm == finished[0].trial.arm]
-    newest = "iteration = (SELECT max(iteration) FROM frames)"
-    sql = f"SELECT kind, com_velocity[1] AS vx, com_velocity[2] AS vy FROM frames WHERE {newest}"
+    sql = f"SELECT kind, com_velocity[1] AS vx, com_velocity[2] AS vy FROM frames WHERE {LATE}"
     rows = pa.concat_tables([query(one.run, sql) for one in finished])
     velocity = np.column_stack([numbers(rows, "vx"), numbers(rows, "vy")])
     kind, moving = numbers(rows, "kind"), np.hypot(*velocity.T) > MOVING_M_PER_S
@@ -242,10 +244,9 @@ def grades(finished: Sequence[Finished]) -> Figure:
 
 
 def _rises(one: Finished) -> tuple[Array, Array]:
-    """Rise of the ground towards the waypoint (deg) and speed towards it (m/s) in the rows of the last iteration."""
-    newest = "iteration = (SELECT max(iteration) FROM frames)"
+    """Rise of the ground towards the waypoint (deg) and speed towards it (m/s), row by row."""
     columns = "episode_id, com_x_m, com_y_m, waypoint_x_m, waypoint_y_m, forward_speed_m_per_s"
-    rows = query(one.run, f"SELECT {columns} FROM frames WHERE {newest} ORDER BY episode_id, step")
+    rows = query(one.run, f"SELECT {columns} FROM frames WHERE {LATE} ORDER BY episode_id, step")
     place = np.column_stack([numbers(rows, "com_x_m"), numbers(rows, "com_y_m")])
     ahead = np.column_stack([numbers(rows, "waypoint_x_m"), numbers(rows, "waypoint_y_m")]) - place
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
