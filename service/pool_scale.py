@@ -60,11 +60,11 @@ class SlotsActor:
     async def ping(self) -> None:
         """A sign of life."""
 
-    async def run(self, slot: int, plan: EpisodePlan) -> tuple[pa.Buffer, pa.Buffer, str]:
+    async def run(self, slot: int, plan: EpisodePlan) -> tuple[pa.Buffer, tuple[pa.Buffer, str]]:
         """Sleep, then send the same numbers under the plan's number."""
         async with self._turns[slot]:
             await asyncio.sleep(EPISODE_S)
-        return _renumbered(self._whole.summary, plan), _renumbered(self._whole.frames, plan), ""
+        return _renumbered(self._whole.frames, plan), (_renumbered(self._whole.summary, plan), "")
 
 
 def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Buffer:
@@ -95,7 +95,7 @@ class SlotsTransport(RayTransport):
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
         assert isinstance(handle, _Slot)
-        self._expect(handle, plan, handle.actor.run.options(num_returns=3).remote(handle.number, plan))
+        self._expect(handle, plan, handle.actor.run.options(num_returns=2).remote(handle.number, plan))
 
 
 def _no_worker(_: object) -> Any:

@@ -80,23 +80,23 @@ class WorkerActor:
     def ping(self) -> None:
         """A sign of life."""
 
-    @ray.method(num_returns=3)
-    def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Buffer | Failure | None, pa.Buffer | None, str]:
-        """Summary, frames and the policy's digest; a Failure, or None without the policy, in the summary's place."""
+    @ray.method(num_returns=2)
+    def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Buffer | None, tuple[pa.Buffer | Failure | None, str]]:
+        """Frames, then summary and policy digest; a Failure, or None without the policy, in the summary's place."""
         if self._worker is None:
             raise RunError("a worker must be opened before it runs plans")
         if self._snapshot is None or self._snapshot.version != plan.policy_version:
             try:
                 self._snapshot = ray.get(holder.version.remote(plan.policy_version), timeout=PULL_DEADLINE_S)
             except ray.exceptions.RayError:
-                return None, None, ""  # the holder has died; its successor will be named with the next plan
+                return None, (None, "")  # the holder has died; its successor will be named with the next plan
             if self._snapshot is None:
-                return None, None, ""
+                return None, (None, "")
             self._digest = policy_digest(self._snapshot)
         result = attempt(self._worker, plan, self._snapshot)
         if isinstance(result, Failure):
-            return result, None, self._digest
-        return ipc.pack(result.summary), ipc.pack(result.frames), self._digest
+            return None, (result, self._digest)
+        return ipc.pack(result.frames), (ipc.pack(result.summary), self._digest)
 
 
 class CaretakerActor:
@@ -188,9 +188,9 @@ class RayTransport(Transport):
         self._expect(handle, plan, handle.actor.run.remote(plan, self._holder))
 
     def _expect(self, handle: Remote, plan: EpisodePlan, answer: Sequence[Any]) -> None:
-        """Of the three parts of an answer the frames alone travel: it counts as come when they are on this node."""
-        summary, frames, digest = answer
-        self._asked[frames] = handle, plan, (summary, digest)
+        """Of both parts of an answer the frames alone travel: it counts as come when they are on this node."""
+        frames, others = answer
+        self._asked[frames] = handle, plan, others
 
     def ping(self, handle: Remote) -> None:
         self._asked[handle.actor.ping.remote()] = handle, None, "ping"
@@ -211,9 +211,10 @@ class RayTransport(Transport):
 
     def _report(self, reference: Any, remote: Remote, plan: EpisodePlan | None, what: Any) -> Report:
         try:
-            answer = ray.get(reference)
-            if plan is not None:
-                result, digest = ray.get(list(what))
+            if plan is None:
+                answer = ray.get(reference)
+            else:
+                answer, (result, digest) = ray.get([reference, what])
                 if isinstance(result, pa.Buffer):
                     result = Episode(ipc.unpack(answer), ipc.unpack(result))
                 return Done(remote, plan, result, digest, reference)
