@@ -172,7 +172,9 @@ def conditions(finished: Sequence[Finished]) -> Figure:
             axes.set_yticks(range(len(names) + 1), ["as trained", *names])
             axes.set_ylim(len(names) + 0.6, -0.6)
             axes.set_xlabel(title)
-        axes.legend()
+        if len(arms) > 1:
+            handles, labels = axes.get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper center", ncols=len(arms))
     return figure
 
 
