@@ -8,9 +8,9 @@ from __future__ import annotations
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
-import pyarrow as pa
 import ray
 
 from t6gps.service import cluster, control
@@ -21,14 +21,11 @@ from t6gps.service.executor import Executor
 from t6gps.service.pool import Pool
 from t6gps.service.ray_transport import MakeWorker, RayTransport
 from t6gps.service.sampler import policy_digest, settings_digest
-from t6gps.storage import ipc
+from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.worker import RolloutWorker
-
-ADDED_AT_ONCE_N = 8
-"""Episodes that the learner gets with one call: a call costs both processes as much as everything else about them."""
 
 
 class LearnerActor:
@@ -39,9 +36,9 @@ class LearnerActor:
 
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
 
-    def add(self, *episodes: pa.Buffer) -> None:
-        for frames in episodes:
-            self._learner.add(ipc.unpack(frames))
+    def add(self, kept: Sequence[Path]) -> None:
+        for path in kept:
+            self._learner.add(spool.read(path).frames)
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         yield from getattr(self._learner, phase)()
@@ -106,8 +103,6 @@ class RayExecutor(Executor):
             autoscale=config.run.autoscale,
         )
         self._learner: Any = None
-        self._newest: tuple[Episode, Any] | None = None  # an episode and the reference to its frames
-        self._handed: list[tuple[Episode, Any]] = []  # the same of those that the learner has not been told of
         self._keep: Callable[[Episode], None] | None = None  # while the workers sample ahead
         self._tend()
 
@@ -115,7 +110,7 @@ class RayExecutor(Executor):
         self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
     ) -> Iterator[Episode]:
         self._begin(plans, snapshot, purpose, None)
-        return self._arrivals()
+        return self.pool.arrivals()
 
     def sample_ahead(
         self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
@@ -134,28 +129,10 @@ class RayExecutor(Executor):
         self.pool.open({version: policy_digest(held) for version, held in self._snapshots.items()})
         self._keep = keep
 
-    def _arrivals(self) -> Iterator[Episode]:
-        for episode, frames in self.pool.arrivals():
-            self._newest = episode, frames
-            yield episode
-        self._newest = None
-
-    def add(self, episode: Episode) -> None:
-        if self._newest is not None and self._newest[0] is episode:
-            frames = self._newest[1]  # just sampled: they are in the object store already
-        else:
-            frames = ipc.pack(episode.frames)
-        self._handed.append((episode, frames))
-        if len(self._handed) == ADDED_AT_ONCE_N:
-            self._hand_over()
-
-    def _hand_over(self) -> None:
-        handed, self._handed = self._handed, []
-        if handed:
-            self._answer(self._of_learner.add.remote(*(frames for _, frames in handed)))
+    def hand_over(self, kept: Sequence[Path]) -> None:
+        self._answer(self._of_learner.add.remote(kept))
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        self._hand_over()
         self.pool.phase = phase
         steps = self._of_learner.learn.options(num_returns="streaming").remote(phase)
         while True:
@@ -167,13 +144,12 @@ class RayExecutor(Executor):
             yield self._answer(step)
 
     def ask(self, method: str, *arguments: Any) -> Any:
-        self._hand_over()
         return self._answer(self._of_learner.ask.remote(method, *arguments))
 
     def replace_learner(self) -> None:
         if self._learner is not None:
             ray.kill(self._learner)
-        self._learner, self._handed = None, []
+        self._learner = None
 
     def close(self) -> None:
         if not ray.is_initialized():
@@ -217,5 +193,5 @@ class RayExecutor(Executor):
             return
         self.pool.tick()
         if self._keep is not None:
-            for episode, _ in self.pool.arrived():
+            for episode in self.pool.arrived():
                 self._keep(episode)

@@ -8,6 +8,7 @@ from __future__ import annotations
 import logging
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from t6gps.service import bundle
@@ -56,8 +57,8 @@ class Executor(ABC):
         """
 
     @abstractmethod
-    def add(self, episode: Episode) -> None:
-        """Hand an episode to the learner."""
+    def hand_over(self, kept: Sequence[Path]) -> None:
+        """Give the learner an iteration's episodes, by their files in the spool: it reads them where they lie."""
 
     @abstractmethod
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:

@@ -76,7 +76,7 @@ class Pool:
         self._by_handle: dict[Handle, Worker] = {}
         self._slots: dict[int, Slot] = {}
         self._times = EpisodeTimes()
-        self._arrived: deque[tuple[int, Episode, Any]] = deque()
+        self._arrived: deque[tuple[int, Episode]] = deque()
         self._largest_bytes = 1
         self._failed_starts_n = 0
         self._last_trouble = ""
@@ -113,8 +113,8 @@ class Pool:
         self._arrived.clear()
         self.phase = "sampling"
 
-    def arrivals(self) -> Iterator[tuple[Episode, Any]]:
-        """New episodes of the ledger's book, and their references, until none is missing.
+    def arrivals(self) -> Iterator[Episode]:
+        """New episodes of the ledger's book until none is missing.
 
         Going on past one says that it is durable.
         """
@@ -125,11 +125,11 @@ class Pool:
         if self.ledger.hopeless:
             self.tick()
 
-    def arrived(self) -> Iterator[tuple[Episode, Any]]:
+    def arrived(self) -> Iterator[Episode]:
         """Those of them that are there, without waiting for others."""
         while self._arrived:
-            episode_id, episode, reference = self._arrived.popleft()
-            yield episode, reference
+            episode_id, episode = self._arrived.popleft()
+            yield episode
             self.ledger.commit(episode_id)
 
     def close(self, state: str, reason: str) -> None:
@@ -180,7 +180,7 @@ class Pool:
             self._slots[worker.slot].failures_n = 0
             self._largest_bytes = max(self._largest_bytes, done.result.frames.nbytes)
             if self.ledger.arrive(done.plan):
-                self._arrived.append((done.plan.episode_id, done.result, done.reference))
+                self._arrived.append((done.plan.episode_id, done.result))
 
     def _acted_as_planned(self, worker: Worker, done: Done) -> bool:
         expected = self._policy_digests.get(done.plan.policy_version, done.policy_digest)

@@ -4,7 +4,7 @@ Each takes a job and gives a tally: when how many control steps were done, on th
 processes of a machine share. `pool_peers` has the libraries.
 
     raw       every process runs the next episode of the plan and forgets it: no Ray, nothing sent, nothing kept
-    service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk, learner told
+    service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk; the learner waits for it
     pipes     a process gets a plan through a pipe and sends the checked episode back; the parent forces it to the spool
 """
 
@@ -178,7 +178,6 @@ def service(job: Job) -> tuple[Tally, dict[str, float]]:
         for episode in executor.sample(job.plans, job.snapshot):
             with clock.of("committer"):
                 spool.append(episode)
-            executor.add(episode)
             if tally.add(steps_of(episode)):
                 break
             if len(tally.done) == 1:

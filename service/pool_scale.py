@@ -28,7 +28,7 @@ from t6gps.service.ledger import Ledger
 from t6gps.service.pool import Pool
 from t6gps.service.pool_contenders import Job, Tally, steps_of
 from t6gps.service.processes import Process
-from t6gps.service.ray_transport import RayTransport, Remote
+from t6gps.service.ray_transport import Answer, RayTransport, Remote
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.transport import Identity
 from t6gps.storage import ipc
@@ -60,11 +60,11 @@ class SlotsActor:
     async def ping(self) -> None:
         """A sign of life."""
 
-    async def run(self, slot: int, plan: EpisodePlan) -> tuple[pa.Buffer, tuple[pa.Buffer, str]]:
+    async def run(self, slot: int, plan: EpisodePlan) -> Answer:
         """Sleep, then send the same numbers under the plan's number."""
         async with self._turns[slot]:
             await asyncio.sleep(EPISODE_S)
-        return _renumbered(self._whole.frames, plan), (_renumbered(self._whole.summary, plan), "")
+        return (_renumbered(self._whole.frames, plan), _renumbered(self._whole.summary, plan)), ""
 
 
 def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Buffer:
@@ -90,12 +90,12 @@ class SlotsTransport(RayTransport):
 
     def start(self, slot: int, incarnation: int) -> Remote:
         remote = _Slot(self._actors[slot % PROCESSES_N], slot)
-        self._asked[remote.actor.open.remote(slot)] = remote, None, "open"
+        self._asked[remote.actor.open.remote(slot)] = remote, "open"
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
         assert isinstance(handle, _Slot)
-        self._expect(handle, plan, handle.actor.run.options(num_returns=2).remote(handle.number, plan))
+        self._asked[handle.actor.run.remote(handle.number, plan)] = handle, plan
 
 
 def _no_worker(_: object) -> Any:
@@ -157,7 +157,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         ledger.open(plans)
         pool.open({})
         wait_s = main_s = 0.0
-        for episode, _ in pool.arrivals():
+        for episode in pool.arrivals():
             begin_s, busy_s = time.monotonic(), time.thread_time()
             with clock.of("committer"):
                 spool.append(Episode(episode.frames, episode.summary))

@@ -1,6 +1,6 @@
 """Workers as Ray actors that pull their weights, and the holder of these weights.
 
-A worker asks the holder for a policy when a plan names another than it has. Tables travel through the object store and
+A worker asks the holder for a policy when a plan names another than it has. Tables travel with the answer of a call and
 are read in place. What Ray cannot do for a process that hangs - show its stacks, end it although it is stopped - is
 done from outside: on this node by the transport itself, on another by a caretaker there.
 """
@@ -10,7 +10,7 @@ from __future__ import annotations
 import logging
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -31,6 +31,7 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.settings import RolloutSettings
 
 MakeWorker = Callable[[RolloutSettings], Runner]
+Answer = tuple[tuple[pa.Buffer, pa.Buffer] | Failure | None, str]
 PULL_DEADLINE_S = 10.0
 EXAMINE_DEADLINE_S = 0.6
 """A caretaker that has not answered by then is cut off, and its node with it."""
@@ -67,12 +68,13 @@ class WorkerActor:
     def __init__(self) -> None:
         self._process = processes.dump_stacks_on_signal()
         self._worker: Runner | None = None
+        self._holder: Any = None
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
-    def open(self, make_worker: MakeWorker, settings: RolloutSettings) -> tuple[Identity, Process, str]:
+    def open(self, make_worker: MakeWorker, settings: RolloutSettings, holder: Any) -> tuple[Identity, Process, str]:
         """Make the worker; who it is, its process, and the node in Ray's words."""
-        self._worker = make_worker(settings)
+        self._worker, self._holder = make_worker(settings), holder
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
         identity = Identity(os.getpid(), address, settings_digest(settings.model_dump_json()))
         return identity, self._process, cluster.this_node()
@@ -80,23 +82,26 @@ class WorkerActor:
     def ping(self) -> None:
         """A sign of life."""
 
-    @ray.method(num_returns=2)
-    def run(self, plan: EpisodePlan, holder: Any) -> tuple[pa.Buffer | None, tuple[pa.Buffer | Failure | None, str]]:
-        """Frames, then summary and policy digest; a Failure, or None without the policy, in the summary's place."""
+    def follow(self, holder: Any) -> None:
+        """Pull policies from another holder from now on."""
+        self._holder = holder
+
+    def run(self, plan: EpisodePlan) -> Answer:
+        """Frames and summary, a Failure, or None without the policy; and the policy's digest."""
         if self._worker is None:
             raise RunError("a worker must be opened before it runs plans")
         if self._snapshot is None or self._snapshot.version != plan.policy_version:
             try:
-                self._snapshot = ray.get(holder.version.remote(plan.policy_version), timeout=PULL_DEADLINE_S)
+                self._snapshot = ray.get(self._holder.version.remote(plan.policy_version), timeout=PULL_DEADLINE_S)
             except ray.exceptions.RayError:
-                return None, (None, "")  # the holder has died; its successor will be named with the next plan
+                return None, ""  # the holder has died; its successor will be named
             if self._snapshot is None:
-                return None, (None, "")
+                return None, ""
             self._digest = policy_digest(self._snapshot)
         result = attempt(self._worker, plan, self._snapshot)
         if isinstance(result, Failure):
-            return None, (result, self._digest)
-        return ipc.pack(result.frames), (ipc.pack(result.summary), self._digest)
+            return result, self._digest
+        return (ipc.pack(result.frames), ipc.pack(result.summary)), self._digest
 
 
 class CaretakerActor:
@@ -154,7 +159,8 @@ class RayTransport(Transport):
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
         self._node, self._logs = cluster.this_node(), _logs()
         self._caretakers: dict[str, Any] = {}
-        self._asked: dict[Any, tuple[Remote, EpisodePlan | None, Any]] = {}
+        self._asked: dict[Any, tuple[Remote, EpisodePlan | str]] = {}
+        self._remotes: set[Remote] = set()
         self._held: dict[int, PolicySnapshot] = {}
         self._holder = start_actor(HolderActor, where=self._node)
         self._holder_pong: Any = None
@@ -181,19 +187,15 @@ class RayTransport(Transport):
 
     def start(self, slot: int, incarnation: int) -> Remote:
         remote = Remote(start_actor(WorkerActor, cpus=self._cpus))
-        self._asked[remote.actor.open.remote(self._make_worker, self._settings)] = remote, None, "open"
+        self._asked[remote.actor.open.remote(self._make_worker, self._settings, self._holder)] = remote, "open"
+        self._remotes.add(remote)
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        self._expect(handle, plan, handle.actor.run.remote(plan, self._holder))
-
-    def _expect(self, handle: Remote, plan: EpisodePlan, answer: Sequence[Any]) -> None:
-        """Of both parts of an answer the frames alone travel: it counts as come when they are on this node."""
-        frames, others = answer
-        self._asked[frames] = handle, plan, others
+        self._asked[handle.actor.run.remote(plan)] = handle, plan
 
     def ping(self, handle: Remote) -> None:
-        self._asked[handle.actor.ping.remote()] = handle, None, "ping"
+        self._asked[handle.actor.ping.remote()] = handle, "ping"
 
     def poll(self, wait_s: float) -> list[Report]:
         self._watch_holder()
@@ -209,15 +211,9 @@ class RayTransport(Transport):
             self._hear_holder()
         return [self._report(reference, *self._asked.pop(reference)) for reference in found]
 
-    def _report(self, reference: Any, remote: Remote, plan: EpisodePlan | None, what: Any) -> Report:
+    def _report(self, reference: Any, remote: Remote, asked: EpisodePlan | str) -> Report:
         try:
-            if plan is None:
-                answer = ray.get(reference)
-            else:
-                answer, (result, digest) = ray.get([reference, what])
-                if isinstance(result, pa.Buffer):
-                    result = Episode(ipc.unpack(answer), ipc.unpack(result))
-                return Done(remote, plan, result, digest, reference)
+            answer = ray.get(reference)
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
             return Died(remote, type(cause).__name__, str(cause))
@@ -226,7 +222,12 @@ class RayTransport(Transport):
             memory = isinstance(error, ray.exceptions.OutOfMemoryError)
             remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
             return Died(remote, type(error).__name__, how)
-        if what == "ping":
+        if isinstance(asked, EpisodePlan):
+            result, digest = answer
+            if isinstance(result, tuple):
+                result = Episode(*map(ipc.unpack, result))
+            return Done(remote, asked, result, digest)
+        if asked == "ping":
             return Alive(remote)
         identity, remote.process, remote.node = answer
         if remote.node != self._node and remote.node not in self._caretakers:
@@ -261,6 +262,7 @@ class RayTransport(Transport):
         elif handle.node in self._caretakers:
             self._caretakers[handle.node].kill.remote(handle.process)
         self._asked = {key: value for key, value in self._asked.items() if value[0] is not handle}
+        self._remotes.discard(handle)
 
     def placed(self, handle: Remote) -> bool:
         known = actors(handle.actor._actor_id.hex())
@@ -290,5 +292,7 @@ class RayTransport(Transport):
         self._holder = start_actor(HolderActor, where=self._node)
         for version in sorted(self._held):
             self._holder.publish.remote(self._held[version])
+        for remote in self._remotes:
+            remote.actor.follow.remote(self._holder)
         self._holder_pong, self._holder_pinged_s = None, time.monotonic()
         self.holders_n += 1

@@ -113,18 +113,16 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         batch = _batch(config, executor, spool)
         plans, episodes = batch.plans, batch.episodes
         arriving = executor.sample(batch.missing, batch.snapshot)
-        for episode in list(episodes.values()):
-            executor.add(episode)
         observer.progress(iteration, "sample", len(episodes), len(plans))
         for episode in arriving:
             spool.append(episode)
-            executor.add(episode)
             episodes[episode.summary["episode_id"][0].as_py()] = episode
             observer.progress(iteration, "sample", len(episodes), len(plans))
     if not episodes:
         raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
     if config.run.pipelined and iteration + 1 < config.run.iterations:
         _sample_ahead(config, run, executor, iteration + 1)
+    executor.hand_over([spool.path(number) for number in episodes])
     for phase in PHASES:
         with _timed(durations, phase):
             for done, total in executor.learn(phase):

@@ -3,12 +3,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
 from typing import Any
 
 from t6gps.learner.learner import Learner
 from t6gps.service.config import Config
 from t6gps.service.executor import Executor
 from t6gps.service.sampler import Failure, attempt
+from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -55,8 +57,9 @@ class SerialExecutor(Executor):
     ) -> None:
         """Nothing runs beside the learner here: all plans are left to `sample`."""
 
-    def add(self, episode: Episode) -> None:
-        self._learner.add(episode.frames)
+    def hand_over(self, kept: Sequence[Path]) -> None:
+        for path in kept:
+            self._learner.add(spool.read(path).frames)
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         yield from getattr(self._learner, phase)()

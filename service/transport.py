@@ -39,16 +39,12 @@ class Alive:
 
 @dataclass(frozen=True)
 class Done:
-    """An attempt is over: an episode, a failure, or None when the worker could not get the policy it needs.
-
-    reference   under which the transport holds the frames
-    """
+    """An attempt is over: an episode, a failure, or None when the worker could not get the policy it needs."""
 
     handle: Handle
     plan: EpisodePlan
     result: Episode | Failure | None
     policy_digest: str = ""
-    reference: Any = None
 
 
 @dataclass(frozen=True)

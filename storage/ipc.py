@@ -16,6 +16,6 @@ def pack(table: pa.Table) -> pa.Buffer:
     return sink.getvalue()
 
 
-def unpack(packed: pa.Buffer | pa.BufferReader) -> pa.Table:
+def unpack(packed: pa.Buffer | pa.NativeFile) -> pa.Table:
     """The table of a stream, or of the next one of a reader, without a copy. ArrowException when it is damaged."""
     return pa.ipc.open_stream(packed).read_all()

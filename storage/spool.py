@@ -44,6 +44,13 @@ def checked(episode: Episode, iteration: int) -> Episode:
     return episode
 
 
+def read(path: Path) -> Episode:
+    """The episode in a file of a spool; its tables lie in the file. ArrowException or OSError when it is torn."""
+    source = pa.memory_map(str(path))
+    frames, summary = (ipc.unpack(source) for _ in range(2))
+    return Episode(frames, summary)
+
+
 class Spool:
     """Episodes of one iteration that were acknowledged and are not committed yet.
 
@@ -58,9 +65,13 @@ class Spool:
         self._folder.mkdir(parents=True, exist_ok=True)
         durable.sync(folder)
 
+    def path(self, episode_id: int) -> Path:
+        """The file of an episode."""
+        return self._folder / f"episode-{episode_id:012d}.arrow"
+
     def append(self, episode: Episode) -> None:
         """Keep a `checked` episode; once this returns, it survives a crash. The same one again replaces its file."""
-        path = self._folder / f"episode-{episode.summary.column('episode_id')[0].as_py():012d}.arrow"
+        path = self.path(episode.summary.column("episode_id")[0].as_py())
         with durable.hidden(path).open("wb") as file:
             for table in (episode.frames, episode.summary):
                 file.write(ipc.pack(table))
@@ -72,14 +83,12 @@ class Spool:
         self.torn = 0
         for path in sorted(self._folder.glob("episode-*.arrow")):
             try:
-                source = pa.BufferReader(path.read_bytes())
-                frames, summary = (ipc.unpack(source) for _ in range(2))
-                episode = checked(Episode(frames, summary), self.iteration)
+                episode = checked(read(path), self.iteration)
             except (pa.ArrowException, OSError, DataError) as error:
                 self.torn += 1
                 _log.warning("%s is torn and will be sampled again: %s", path, error)
                 continue
-            whole[summary.column("episode_id")[0].as_py()] = episode
+            whole[episode.summary.column("episode_id")[0].as_py()] = episode
         return whole
 
     def clear(self) -> None:

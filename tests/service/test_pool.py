@@ -160,7 +160,7 @@ class House:
         return int(self.pool.status(self.paper.now_s)["ready"])
 
     def sample(self) -> Iterator[int]:
-        for episode, _ in self.pool.arrivals():
+        for episode in self.pool.arrivals():
             yield episode.summary["episode_id"][0].as_py()
 
 
