@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Generator, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -19,13 +19,14 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, localization, lqg, policy, report, standard_gps, supervised, surrogate
+from t6gps.learner import cost, localization, lqg, policy, report, standard_gps, supervised, surrogate, value
 from t6gps.learner.features import Rows, read_rows
 from t6gps.learner.modes import FitOptions
 from t6gps.learner.report import Fitted, Improved, Segmented, Trained, root_mean_square
 from t6gps.learner.segments import cut, group
 from t6gps.learner.settings import LearnerSettings, Localization
-from t6gps.storage import schema
+from t6gps.storage import schema, tables
+from t6gps.storage.catalog import Run
 from t6gps.storage.errors import CheckpointError, DataError, RunError
 from t6gps.storage.records import PolicySnapshot
 
@@ -36,8 +37,8 @@ FitMap = Callable[
 Pairs = tuple[NDArray[np.float32], NDArray[np.float32]]
 Phase = TypeVar("Phase")
 
-LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM = 1, 1, 2
-"""Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy)."""
+LEARNER_STREAM, SUPERVISED_STREAM, INITIAL_STREAM, VALUE_STREAM = 1, 1, 2, 3
+"""Branches of the run's seed sequence: (1, iteration, 0 fits | 1 S-step | 2 untrained policy | 3 action value)."""
 SEGMENTED = (Localization.SEGMENTS, Localization.TIME)
 """Localizations that fit the models of segment classes; the others leave the table `classes` empty."""
 SEEN_N = {"sensors": schema.SENSORS_N, "shape": schema.OBSERVATION_N}
@@ -55,7 +56,9 @@ class Learner:
     vertical_weight        weight of the vertical velocity in the cost
     command_range_m        improved actions are clipped to it
     offset_m, scale_m      u = offset + scale * network
+    reach_m                farthest that a winch comes in a control step
     world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
+    mirrored               the symmetry element mirrors the world [elements]
     fit_map                applies a pure function to jobs and returns the results in their order; `map` or a
                            pool
     keeps_earlier          the policy before the newest is kept, too, for workers that act with it in a pipelined run
@@ -71,7 +74,9 @@ class Learner:
         command_range_m: tuple[float, float],
         offset_m: float,
         scale_m: float,
+        reach_m: float,
         world_labels: NDArray[np.int64],
+        mirrored: NDArray[np.bool_],
         fit_map: FitMap = map,
         keeps_earlier: bool = False,
     ) -> None:
@@ -80,7 +85,7 @@ class Learner:
         self._target_speed_m_per_s = target_speed_m_per_s
         self._vertical_weight = vertical_weight
         self._command_range_m = command_range_m
-        self._world_labels = world_labels
+        self._world_labels, self._mirrored = world_labels, mirrored
         self._fit_map = fit_map
         self._keeps_earlier = keeps_earlier
         action_n = schema.vector_length(schema.FRAMES.field("action"))
@@ -94,6 +99,7 @@ class Learner:
             scale_m=scale_m,
         )
         self._earlier: PolicySnapshot | None = None
+        self._value = value.ActionValue(reach_m, self._rng(0, VALUE_STREAM)) if settings.value_from else None
         self._replayed: deque[Pairs] = deque(maxlen=settings.replay_iterations)
         self._episodes: dict[int, pa.Table] = {}
         self._segmented: Segmented | None = None
@@ -128,6 +134,8 @@ class Learner:
             rows = standard_gps.read_rows(self._episodes, self._world_labels)
         else:
             rows = read_rows(self._episodes, self._settings.reduced_state)
+        if self._value:
+            self._value.add(value.read(self._episodes, self._mirrored))
         self._episodes.clear()
         self._fitted = self._improved = self._trained = None
         yield 1, 2
@@ -159,7 +167,7 @@ class Learner:
         self._fitted = Fitted(fits, patch)
 
     def backward_pass(self) -> Iterator[tuple[int, int]]:
-        """Improve the actions along all sub-trajectories (lines 8 to 11)."""
+        """Improve the actions along all sub-trajectories (lines 8 to 11), or by the action value where that leads."""
         rows, patch = _of(self._segmented, "segment").rows, _of(self._fitted, "fit").patch
         settings = self._settings
         weights = self._target_speed_m_per_s, self._vertical_weight
@@ -173,12 +181,18 @@ class Learner:
             for length, starts in lqg.sub_trajectories(rows.continues, settings.horizon_steps).items()
             for first in range(0, len(starts), CHUNK)
         ]
+        total = sum(map(len, chunks))
+        climbed = yield from self._climb_value(total)
 
         def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
-            result = lqg.backward_pass(models, patch.of_row[steps], gradient[steps + 1], hessian, deviation[steps])
+            given = models, patch.of_row[steps], gradient[steps + 1], hessian
+            if climbed is not None:
+                k = climbed[steps] - rows.action[steps]
+                return k, lqg.predicted_change(*given, k)
+            result = lqg.backward_pass(*given, deviation[steps])
             return result.k, result.predicted_cost_change
 
-        total, done = sum(map(len, chunks)), 0
+        done = 0
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             for steps, (k, change) in zip(chunks, threads.map(improve, chunks), strict=True):
                 improved[steps], predicted[steps] = rows.action[steps] + k, change
@@ -186,6 +200,16 @@ class Learner:
                 yield done, total
         improved = np.clip(improved, *self._command_range_m).astype(np.float32)
         self._improved = Improved(improved, predicted, total)
+
+    def _climb_value(self, sub_trajectories_n: int) -> Generator[tuple[int, int], None, NDArray[np.float32] | None]:
+        """Improved actions by the action value, None while it does not lead yet."""
+        version = self.snapshot.version
+        if self._value is None or version < self._settings.value_from:
+            return None
+        total = self._value.steps_n + sub_trajectories_n
+        for done, _ in enumerate(self._value.learn(self.snapshot, self._rng(version, VALUE_STREAM)), 1):
+            yield done, total
+        return np.clip(self._value.improved(self.snapshot), *self._command_range_m)
 
     def _deviation(self, rows: Rows, patch: surrogate.Patch) -> tuple[NDArray[np.float32], float | None]:
         """Recorded action minus policy mean [n, nu], and the exploration variance if it is to replace the fitted S."""
@@ -226,12 +250,14 @@ class Learner:
         return iteration, [number | row for row in classes]
 
     def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        """What the next iteration depends on, between two iterations: policies and replayed pairs."""
+        """What the next iteration depends on, between two iterations: policies, replayed pairs, the action value."""
         arrays = _arrays(self.snapshot, "layer")
         if self._earlier is not None:
             arrays |= _arrays(self._earlier, "earlier_layer")
         for number, (observations, actions) in enumerate(self._replayed):
             arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"] = observations, actions
+        if self._value:
+            arrays |= self._value.arrays()
         manifest = {
             "version": self.snapshot.version,
             "offset_m": self.snapshot.offset_m,
@@ -252,6 +278,8 @@ class Learner:
                 (arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"])
                 for number in range(manifest["replays"])
             ]
+            if self._value:
+                self._value.restore(arrays)
         except KeyError as error:
             raise CheckpointError(f"the learner's checkpoint lacks {error}; use an older checkpoint") from error
         found = [weight.shape for weight, _ in restored.layers]
@@ -264,6 +292,14 @@ class Learner:
         self.snapshot, self._earlier = restored, earlier
         self._replayed = deque(replayed, maxlen=self._settings.replay_iterations)
         self._episodes.clear()
+
+    def recall(self, run: Run) -> None:
+        """Read from a run's tables what the next iteration depends on beside `state()`: earlier transitions."""
+        if self._value is None:
+            return
+        newest = self.snapshot.version
+        for iteration in range(max(newest - value.REMEMBERED_N + 1, 0), newest):
+            self._value.add(value.read(tables.frames_of(run, iteration, value.COLUMNS), self._mirrored))
 
 
 def _arrays(snapshot: PolicySnapshot, name: str) -> dict[str, NDArray[Any]]:

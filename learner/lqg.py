@@ -109,6 +109,19 @@ def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Arra
     return found
 
 
+def predicted_change(models: LqgModels, model: Ints, gradient: Array, hessian: Array, change: Array) -> Array:
+    """Change of the running cost after each step [b, T] (m2/s2) when actions change by `change` [b, T, nu].
+
+    What the models promise of actions from elsewhere, as `Improvement` does of those of the backward pass.
+    """
+    deviation, found = np.zeros_like(gradient[:, 0]), np.empty(model.shape, dtype=np.float32)
+    for step in range(model.shape[1]):
+        both = np.concatenate([deviation, change[:, step]], axis=1)
+        deviation = np.einsum("bij,bj->bi", models.F[model[:, step]], both)
+        found[:, step] = np.einsum("bi,bi->b", gradient[:, step] + deviation @ hessian / 2, deviation)
+    return found
+
+
 def sub_trajectories(continues: NDArray[np.bool_], horizon_steps: int) -> dict[int, Ints]:
     """First rows of all sub-trajectories by their length (paper Sec. III-F; GetSubTrajectories of Algorithm 2).
 

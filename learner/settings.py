@@ -3,7 +3,7 @@
 from enum import StrEnum
 from typing import Annotated, Literal
 
-from pydantic import Field
+from pydantic import Field, model_validator
 
 from t6gps.storage.settings import Settings
 
@@ -62,3 +62,12 @@ class LearnerSettings(Settings):
     batch: int = Field(512, ge=1, le=100_000, description="pairs per gradient step")
     learning_rate: float = Field(1e-3, gt=0.0, le=1.0, description="initial step of Adam, decays to zero")
     replay_iterations: int = Field(1, ge=0, le=10, description="earlier iterations whose pairs are used again")
+    value_from: int = Field(
+        0, ge=0, le=10_000, description="iteration from which a learned action value improves the actions; 0: never"
+    )
+
+    @model_validator(mode="after")
+    def _value_in_canonical_frames(self) -> "LearnerSettings":
+        if self.value_from and self.localization is Localization.TIME:
+            raise ValueError("value_from must be 0 with localization = time, whose actions are in world axes")
+        return self

@@ -66,7 +66,7 @@ class Executor(ABC):
 
     @abstractmethod
     def ask(self, method: str, *arguments: Any) -> Any:
-        """Call a method of the learner: `policy`, `report`, `state` or `restore`."""
+        """Call a method of the learner: `policy`, `report`, `state`, `restore` or `recall`."""
 
     @abstractmethod
     def replace_learner(self) -> None:

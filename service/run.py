@@ -73,6 +73,7 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
             if latest is not None:
                 first, manifest, arrays = latest
                 executor.ask("restore", manifest, arrays)
+                executor.ask("recall", run)
                 if not resumed:
                     executor.ledger.restore(manifest.get("ledger"))
             resumed = True

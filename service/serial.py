@@ -14,9 +14,9 @@ from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers.physics import Simulation, nominal_rest_length
+from t6gps.workers.physics import CONTROL_STEP_S, Simulation, nominal_rest_length
 from t6gps.workers.settings import RobotSettings
-from t6gps.workers.symmetry import CABLE_MAP
+from t6gps.workers.symmetry import CABLE_MAP, PROPER
 from t6gps.workers.worker import RolloutWorker
 
 ACTION_SCALE_M = 0.2
@@ -85,7 +85,9 @@ def new_learner(config: Config, **options: Any) -> Learner:
         command_range_m=(robot.shortest_command_m, robot.longest_command_m),
         offset_m=nominal_rest_length(robot),
         scale_m=ACTION_SCALE_M,
+        reach_m=robot.winch_speed_m_per_s * CONTROL_STEP_S,
         world_labels=CABLE_MAP,
+        mirrored=~PROPER,
         keeps_earlier=config.run.pipelined,
         **options,
     )

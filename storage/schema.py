@@ -20,6 +20,8 @@ nullable, since older runs have none. Version 4 added the nodes to `observation`
 SENSORS_N, SHAPE_N = 47, 36
 OBSERVATION_N = SENSORS_N + SHAPE_N
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
+TARGET = slice(43, 45)
+"""Of these the target direction."""
 
 
 def _scalar(name: str, kind: pa.DataType, unit: str, text: str, nullable: bool = False) -> pa.Field:

@@ -11,6 +11,7 @@ import time
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
@@ -109,6 +110,20 @@ def episode_frames(run: Run, episode_id: int) -> pa.Table:
     raise DataError(
         f"run {run.name} has no episode {episode_id}; its {len(known)} episodes lie in {ends['min']} .. {ends['max']}"
     )
+
+
+def frames_of(run: Run, iteration: int, columns: Sequence[str]) -> dict[int, pa.Table]:
+    """Columns of the frames of an iteration by episode, in ascending order."""
+    where = pc.field("iteration") == iteration
+    table = read(run, "frames", [*columns, "episode_id", "step"], where).sort_by(
+        [("episode_id", "ascending"), ("step", "ascending")]
+    )
+    numbers, first = np.unique(table.column("episode_id").to_numpy(), return_index=True)
+    lengths = np.diff(first, append=table.num_rows)
+    return {
+        int(number): table.slice(start, length).select(columns)
+        for number, start, length in zip(numbers, first.tolist(), lengths.tolist(), strict=True)
+    }
 
 
 def _files(folder: Path) -> list[str]:

@@ -153,7 +153,9 @@ def make_learner() -> Callable[..., Learner]:
             command_range_m=(0.65, 1.35),
             offset_m=OFFSET_M,
             scale_m=SCALE_M,
+            reach_m=0.07,
             world_labels=np.tile(np.arange(24), (24, 1)),
+            mirrored=np.arange(24) % 2 == 1,
             fit_map=fit_map,
             keeps_earlier=keeps_earlier,
         )

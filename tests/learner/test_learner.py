@@ -240,7 +240,7 @@ CHANGES = {
 
 
 def test_every_setting_matters(tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate) -> None:
-    elsewhere = {"replay_iterations"}  # below
+    elsewhere = {"replay_iterations", "value_from"}  # below, and in test_value
     assert {*CHANGES, *elsewhere} == set(LearnerSettings.model_fields)
     results = []
     for change in [{}, *({name: value} for name, value in CHANGES.items())]:

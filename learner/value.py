@@ -1,0 +1,214 @@
+"""Improved actions from a learned action value (beyond the paper): it sees farther than local models reach.
+
+    Q(s, e) = E[ sum_k gamma^k r[k+1] ]     r  forward speed less its mean, along a fixed direction
+    e = clip((u - rest lengths) / reach, -1, 1)      reach: the farthest that a winch comes in a control step
+
+s holds the observation and the velocities of centre of mass and nodes. Most commands lie farther from the rest lengths
+than the winches reach in a step; e is all that they do in it. Q is a network, learned by temporal differences from the
+transitions of several iterations, whatever policy made them: in the next state the newest policy acts (fitted Q
+evaluation). Physics does not know the waypoint, so half of the transitions are learned from as if it lay in a random
+direction, which both ends of the transition see, and the reward is the speed in that direction.
+
+Improved actions climb Q from the policy's own within a penalty on the distance,
+
+    u* = argmax_u  Q(s, e(u)) - |u - u0|^2 / (2 w)
+
+A command beyond the reach of its winch changes nothing in this step and stays.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from typing import Any, NamedTuple
+
+import numpy as np
+import pyarrow as pa
+import torch
+from numpy.typing import NDArray
+
+from t6gps.learner import policy, supervised
+from t6gps.learner.features import acting_rows
+from t6gps.storage import schema
+from t6gps.storage.records import PolicySnapshot
+
+Floats = NDArray[np.float32]
+
+INPUTS = ("observation", "com_velocity", "node_velocities", "action")
+COLUMNS = (*INPUTS, "rest_lengths", "target_direction", "frame_yaw_rad", "element")
+"""Columns of `frames` that the value is learned from, and of these what its network gets."""
+*_, ACTION_N = LENGTHS = [schema.vector_length(schema.FRAMES.field(name)) or 0 for name in INPUTS]
+INPUTS_N = sum(LENGTHS)
+REMEMBERED_N = 3
+"""Iterations whose transitions are learned from; 25,000 transitions alone mislead the value."""
+DISCOUNT = 0.95
+"""Per control step: two seconds, about a flop or two."""
+HIDDEN = (256, 256)
+BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 3e-4
+"""Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
+TARGET_RATE = 0.005
+"""The network in the temporal-difference target follows the learned one by this share per step."""
+OWN_SHARE = 0.5
+"""Share of transitions that are learned from with the direction of their waypoint."""
+STEP_WEIGHT = 0.3
+"""w (m2 s/m): larger ones trust the value farther from the policy."""
+ASCENTS, ASCENT_RATE = 8, 0.3
+
+
+class Transitions(NamedTuple):
+    """Rows of the episodes of one iteration [n], in order.
+
+    observation    [n, ny];   velocities    of centre of mass and nodes [n, 39] (m/s);   rest_lengths [n, nu] (m)
+    action         commanded, noise included [n, nu] (m); zero in the last row of an episode
+    turn, side     a horizontal direction of the world has the angle turn + side * angle in the frame of a row [n]
+    heading        of the waypoint in the world [n] (rad)
+    acts           the row has an action, and the row after it is what followed [n]
+    """
+
+    observation: Floats
+    velocities: Floats
+    rest_lengths: Floats
+    action: Floats
+    turn: Floats
+    side: Floats
+    heading: Floats
+    acts: NDArray[np.bool_]
+
+    def seen(self, rows: NDArray[np.int64], heading: Floats) -> tuple[torch.Tensor, torch.Tensor]:
+        """What a policy sees in `rows` [m] if the waypoint lies at `heading` [m], and the forward speed there [m]."""
+        angle = self.turn[rows] + self.side[rows] * heading
+        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        observation = self.observation[rows]
+        observation[:, schema.TARGET] = direction
+        speed = np.einsum("ij,ij->i", self.velocities[rows, :2], direction)
+        return torch.from_numpy(observation), torch.from_numpy(speed)
+
+
+def read(episodes: Mapping[int, pa.Table], mirrored: NDArray[np.bool_]) -> Transitions:
+    """Transitions of the `frames` tables in `episodes`; DataError as for `features.read_rows`.
+
+    `mirrored` [elements] says which symmetry elements mirror the world.
+    """
+    tables, acts, _ = acting_rows(episodes)
+    table = pa.concat_tables([table.select(COLUMNS) for table in tables])
+    *numbers, element = (schema.array(table, name) for name in COLUMNS)
+    observation, com, nodes, action, rest, target, turn = (np.asarray(part, dtype=np.float32) for part in numbers)
+    whole = np.zeros_like(rest)
+    whole[acts] = action
+    side = np.where(mirrored[element], np.float32(-1), np.float32(1))
+    heading = side * (np.arctan2(target[:, 1], target[:, 0]) - turn)
+    return Transitions(observation, np.hstack([com, nodes]), rest, whole, turn, side, heading, acts)
+
+
+class ActionValue:
+    """Q of the newest policy, and the transitions that it is learned from.
+
+    reach_m   farthest that a winch comes in a control step
+    """
+
+    def __init__(self, reach_m: float, rng: np.random.Generator) -> None:
+        first = policy.initial(INPUTS_N, 1, HIDDEN, rng, offset_m=0.0, scale_m=1.0)
+        self._reach_m = reach_m
+        self._vector, self._layers = policy.parameters(first)
+        self._target, self._target_layers = policy.parameters(first)
+        self._optimiser = torch.optim.AdamW([self._vector], lr=LEARNING_RATE, fused=True)
+        self._remembered: deque[Transitions] = deque(maxlen=REMEMBERED_N)
+
+    @property
+    def steps_n(self) -> int:
+        """Gradient steps that `learn` will take."""
+        return STEPS if self._optimiser.state.get(self._vector) else FIRST_STEPS
+
+    def add(self, transitions: Transitions) -> None:
+        """Take the transitions of one iteration; those of the oldest go."""
+        self._remembered.append(transitions)
+
+    def learn(self, snapshot: PolicySnapshot, rng: np.random.Generator) -> Iterator[None]:
+        """Take `steps_n` gradient steps towards the value of a policy; yields after each."""
+        torch.set_num_threads(supervised.THREADS_PER_SHARD)
+        known = Transitions(*map(np.concatenate, zip(*self._remembered, strict=True)))
+        index = np.flatnonzero(known.acts)
+        mean = known.seen(index + 1, known.heading[index])[1].mean()
+        act = _actor(snapshot)
+
+        def gradient(rows: NDArray[np.int64], heading: Floats) -> torch.Tensor:
+            after, speed = known.seen(rows + 1, heading)
+            follows = policy.activations(self._target_layers, self._inputs(known, rows + 1, after, act(after)))[-1]
+            wanted = (speed - mean)[:, None] + DISCOUNT * follows
+            before, _ = known.seen(rows, heading)
+            inputs = self._inputs(known, rows, before, torch.from_numpy(known.action[rows]))
+            return supervised.gradient(self._layers, inputs, wanted, BATCH)
+
+        with ThreadPoolExecutor(supervised.SHARDS) as threads:
+            for _ in range(self.steps_n):
+                rows = rng.choice(index, BATCH)
+                anywhere = rng.uniform(-np.pi, np.pi, BATCH).astype(np.float32)
+                heading = np.where(rng.random(BATCH) < OWN_SHARE, known.heading[rows], anywhere)
+                parts = (np.array_split(part, supervised.SHARDS) for part in (rows, heading))
+                self._vector.grad = torch.stack(list(threads.map(gradient, *parts))).sum(dim=0)
+                self._optimiser.step()
+                self._target.lerp_(self._vector, TARGET_RATE)
+                yield
+
+    def improved(self, snapshot: PolicySnapshot) -> Floats:
+        """u* [n, nu] (m) at the rows of the newest transitions."""
+        torch.set_num_threads(supervised.THREADS_PER_SHARD)
+        newest, act = self._remembered[-1], _actor(snapshot)
+
+        def climb(rows: NDArray[np.int64]) -> torch.Tensor:
+            seen = torch.from_numpy(newest.observation[rows])
+            own = act(seen)
+            command = own.clone()
+            for _ in range(ASCENTS):
+                slope = self._slope(self._inputs(newest, rows, seen, command))
+                command += ASCENT_RATE * (own + STEP_WEIGHT * slope - command)
+            return command
+
+        n = len(newest.acts)
+        with ThreadPoolExecutor(supervised.SHARDS) as threads:
+            climbed = threads.map(climb, np.split(np.arange(n), range(policy.ROWS, n, policy.ROWS)))
+            found: Floats = torch.cat(list(climbed)).numpy()
+        return found
+
+    def _inputs(
+        self, known: Transitions, rows: NDArray[np.int64], seen: torch.Tensor, command: torch.Tensor
+    ) -> torch.Tensor:
+        """[s; e] of rows [m] under commands [m, nu]."""
+        moved = ((command - torch.from_numpy(known.rest_lengths[rows])) / self._reach_m).clamp_(-1, 1)
+        return torch.cat([seen, torch.from_numpy(known.velocities[rows]), moved], dim=1)
+
+    def _slope(self, inputs: torch.Tensor) -> torch.Tensor:
+        """dQ/du [m, nu] (1/s): zero where the winch cannot reach."""
+        values = policy.activations(self._layers, inputs)
+        back = self._layers[-1][0].expand(len(inputs), -1)
+        for number in reversed(range(len(HIDDEN))):
+            back = (back * (1 - values[number + 1].square())) @ self._layers[number][0]
+        moved = inputs[:, -ACTION_N:]
+        return back[:, -ACTION_N:].mul(moved.abs() < 1).div_(self._reach_m)
+
+    def arrays(self) -> dict[str, NDArray[Any]]:
+        """What the next iteration depends on, but for the transitions, which the run's tables hold."""
+        found = {"learned": self._vector, "target": self._target} | self._optimiser.state.get(self._vector, {})
+        return {f"value_{name}": tensor.numpy().copy() for name, tensor in found.items()}
+
+    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+        """Continue from `arrays()`; the transitions are yet to be added. KeyError when an entry is missing."""
+        self._remembered.clear()
+        self._vector.copy_(torch.from_numpy(arrays["value_learned"]))
+        self._target.copy_(torch.from_numpy(arrays["value_target"]))
+        self._optimiser.state.clear()
+        if "value_step" in arrays:
+            moments = {name: torch.from_numpy(arrays[f"value_{name}"]) for name in ("step", "exp_avg", "exp_avg_sq")}
+            self._optimiser.state[self._vector] = moments
+
+
+def _actor(snapshot: PolicySnapshot) -> Callable[[torch.Tensor], torch.Tensor]:
+    """Rest lengths [m, nu] (m) that a policy commands without noise for observations [m, ny]."""
+    _, layers = policy.parameters(snapshot)
+    seen_n = layers[0][0].shape[1]
+
+    def act(seen: torch.Tensor) -> torch.Tensor:
+        return policy.activations(layers, seen[:, :seen_n])[-1].mul_(snapshot.scale_m).add_(snapshot.offset_m)
+
+    return act
