@@ -99,7 +99,10 @@ class Learner:
             scale_m=scale_m,
         )
         self._earlier: PolicySnapshot | None = None
-        self._value = value.ActionValue(reach_m, self._rng(0, VALUE_STREAM)) if settings.value_from else None
+        self._value: value.ActionValue | None = None
+        if settings.value_from:
+            weights = target_speed_m_per_s, vertical_weight
+            self._value = value.ActionValue(reach_m, *weights, self._rng(0, VALUE_STREAM))
         self._replayed: deque[Pairs] = deque(maxlen=settings.replay_iterations)
         self._episodes: dict[int, pa.Table] = {}
         self._segmented: Segmented | None = None

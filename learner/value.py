@@ -1,13 +1,13 @@
 """Improved actions from a learned action value (beyond the paper): it sees farther than local models reach.
 
-    Q(s, e) = E[ sum_k gamma^k r[k+1] ]     r  forward speed less its mean, along a fixed direction
+    Q(s, e) = E[ sum_k gamma^k r[k+1] ]     r = -cost / (2 v*), less its mean: as the forward speed, in m/s
     e = clip((u - rest lengths) / reach, -1, 1)      reach: the farthest that a winch comes in a control step
 
 s holds the observation and the velocities of centre of mass and nodes. Most commands lie farther from the rest lengths
 than the winches reach in a step; e is all that they do in it. Q is a network, learned by temporal differences from the
 transitions of several iterations, whatever policy made them: in the next state the newest policy acts (fitted Q
 evaluation). Physics does not know the waypoint, so half of the transitions are learned from as if it lay in a random
-direction, which both ends of the transition see, and the reward is the speed in that direction.
+direction, which both ends of the transition see and to which the cost refers.
 
 Improved actions climb Q from the policy's own within a penalty on the distance,
 
@@ -28,7 +28,7 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
-from t6gps.learner import policy, supervised
+from t6gps.learner import cost, policy, supervised
 from t6gps.learner.features import acting_rows
 from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
@@ -44,8 +44,8 @@ REMEMBERED_N = 3
 """Iterations whose transitions are learned from; 25,000 transitions alone mislead the value."""
 DISCOUNT = 0.95
 """Per control step: two seconds, about a flop or two."""
-HIDDEN = (256, 256)
-BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 3e-4
+HIDDEN = (128, 128)
+BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 1e-3
 """Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
 TARGET_RATE = 0.005
 """The network in the temporal-difference target follows the learned one by this share per step."""
@@ -53,7 +53,7 @@ OWN_SHARE = 0.5
 """Share of transitions that are learned from with the direction of their waypoint."""
 STEP_WEIGHT = 0.3
 """w (m2 s/m): larger ones trust the value farther from the policy."""
-ASCENTS, ASCENT_RATE = 8, 0.3
+ASCENTS, ASCENT_RATE = 4, 0.5
 
 
 class Transitions(NamedTuple):
@@ -75,14 +75,16 @@ class Transitions(NamedTuple):
     heading: Floats
     acts: NDArray[np.bool_]
 
-    def seen(self, rows: NDArray[np.int64], heading: Floats) -> tuple[torch.Tensor, torch.Tensor]:
-        """What a policy sees in `rows` [m] if the waypoint lies at `heading` [m], and the forward speed there [m]."""
+    def direction(self, rows: NDArray[np.int64], heading: Floats) -> Floats:
+        """A heading [m] in the frames of rows [m, 2]."""
         angle = self.turn[rows] + self.side[rows] * heading
-        direction = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+        return np.stack([np.cos(angle), np.sin(angle)], axis=1)
+
+    def seen(self, rows: NDArray[np.int64], direction: Floats) -> torch.Tensor:
+        """What a policy sees in rows [m, ny] if the waypoint lies in a direction [m, 2]."""
         observation = self.observation[rows]
         observation[:, schema.TARGET] = direction
-        speed = np.einsum("ij,ij->i", self.velocities[rows, :2], direction)
-        return torch.from_numpy(observation), torch.from_numpy(speed)
+        return torch.from_numpy(observation)
 
 
 def read(episodes: Mapping[int, pa.Table], mirrored: NDArray[np.bool_]) -> Transitions:
@@ -104,10 +106,14 @@ def read(episodes: Mapping[int, pa.Table], mirrored: NDArray[np.bool_]) -> Trans
 class ActionValue:
     """Q of the newest policy, and the transitions that it is learned from.
 
-    reach_m   farthest that a winch comes in a control step
+    reach_m                                 farthest that a winch comes in a control step
+    target_speed_m_per_s, vertical_weight   v* of the cost and weight of the vertical velocity in it
     """
 
-    def __init__(self, reach_m: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self, reach_m: float, target_speed_m_per_s: float, vertical_weight: float, rng: np.random.Generator
+    ) -> None:
+        self._target_speed_m_per_s, self._vertical_weight = target_speed_m_per_s, vertical_weight
         first = policy.initial(INPUTS_N, 1, HIDDEN, rng, offset_m=0.0, scale_m=1.0)
         self._reach_m = reach_m
         self._vector, self._layers = policy.parameters(first)
@@ -129,14 +135,16 @@ class ActionValue:
         torch.set_num_threads(supervised.THREADS_PER_SHARD)
         known = Transitions(*map(np.concatenate, zip(*self._remembered, strict=True)))
         index = np.flatnonzero(known.acts)
-        mean = known.seen(index + 1, known.heading[index])[1].mean()
+        mean = self._reward(known, index + 1, known.direction(index + 1, known.heading[index])).mean()
         act = _actor(snapshot)
 
         def gradient(rows: NDArray[np.int64], heading: Floats) -> torch.Tensor:
-            after, speed = known.seen(rows + 1, heading)
+            direction = known.direction(rows + 1, heading)
+            after = known.seen(rows + 1, direction)
             follows = policy.activations(self._target_layers, self._inputs(known, rows + 1, after, act(after)))[-1]
-            wanted = (speed - mean)[:, None] + DISCOUNT * follows
-            before, _ = known.seen(rows, heading)
+            reward = self._reward(known, rows + 1, direction) - mean
+            wanted = torch.from_numpy(reward)[:, None] + DISCOUNT * follows
+            before = known.seen(rows, known.direction(rows, heading))
             inputs = self._inputs(known, rows, before, torch.from_numpy(known.action[rows]))
             return supervised.gradient(self._layers, inputs, wanted, BATCH)
 
@@ -170,6 +178,12 @@ class ActionValue:
             climbed = threads.map(climb, np.split(np.arange(n), range(policy.ROWS, n, policy.ROWS)))
             found: Floats = torch.cat(list(climbed)).numpy()
         return found
+
+    def _reward(self, known: Transitions, rows: NDArray[np.int64], direction: Floats) -> Floats:
+        """-cost / (2 v*) in rows [m] (m/s)."""
+        speed = self._target_speed_m_per_s
+        spent = cost.running_cost(known.velocities[rows], direction, speed, self._vertical_weight)
+        return (spent / (-2 * speed)).astype(np.float32)
 
     def _inputs(
         self, known: Transitions, rows: NDArray[np.int64], seen: torch.Tensor, command: torch.Tensor

@@ -28,7 +28,7 @@ def learner() -> dict[str, float]:
     learning from them, then the 300 episodes that are measured - a robot that rolls, as in all but the first
     iteration. That takes one to two minutes on two cores and is not part of any figure.
     """
-    config = configuration.load("rough", [])
+    config = configuration.load("rough", ["run.episodes=300"])
     policy = new_learner(config)
     untrained, trained = seeding.training_plans(config, 0)[:UNTRAINED_EPISODES], seeding.training_plans(config, 1)
     with closing(RayExecutor(config)) as executor:
