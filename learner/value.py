@@ -47,6 +47,8 @@ DISCOUNT = 0.95
 HIDDEN = (128, 128)
 BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 1e-3
 """Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
+PREPARED_N = 30
+"""Gradient steps whose transitions are prepared at once, by both threads; a step alone is too small for two."""
 TARGET_RATE = 0.005
 """The network in the temporal-difference target follows the learned one by this share per step."""
 OWN_SHARE = 0.5
@@ -138,26 +140,31 @@ class ActionValue:
         mean = self._reward(known, index + 1, known.direction(index + 1, known.heading[index])).mean()
         act = _actor(snapshot)
 
-        def gradient(rows: NDArray[np.int64], heading: Floats) -> torch.Tensor:
+        def prepare(rows: NDArray[np.int64], heading: Floats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
             direction = known.direction(rows + 1, heading)
-            after = known.seen(rows + 1, direction)
-            follows = policy.activations(self._target_layers, self._inputs(known, rows + 1, after, act(after)))[-1]
-            reward = self._reward(known, rows + 1, direction) - mean
-            wanted = torch.from_numpy(reward)[:, None] + DISCOUNT * follows
-            before = known.seen(rows, known.direction(rows, heading))
-            inputs = self._inputs(known, rows, before, torch.from_numpy(known.action[rows]))
-            return supervised.gradient(self._layers, inputs, wanted, BATCH)
+            after, before = known.seen(rows + 1, direction), known.seen(rows, known.direction(rows, heading))
+            return (
+                self._inputs(known, rows, before, torch.from_numpy(known.action[rows])),
+                self._inputs(known, rows + 1, after, act(after)),
+                torch.from_numpy(self._reward(known, rows + 1, direction) - mean)[:, None],
+            )
 
         with ThreadPoolExecutor(supervised.SHARDS) as threads:
-            for _ in range(self.steps_n):
-                rows = rng.choice(index, BATCH)
-                anywhere = rng.uniform(-np.pi, np.pi, BATCH).astype(np.float32)
-                heading = np.where(rng.random(BATCH) < OWN_SHARE, known.heading[rows], anywhere)
-                parts = (np.array_split(part, supervised.SHARDS) for part in (rows, heading))
-                self._vector.grad = torch.stack(list(threads.map(gradient, *parts))).sum(dim=0)
-                self._optimiser.step()
-                self._target.lerp_(self._vector, TARGET_RATE)
-                yield
+            for _ in range(self.steps_n // PREPARED_N):
+                rows = rng.choice(index, PREPARED_N * BATCH)
+                anywhere = rng.uniform(-np.pi, np.pi, len(rows)).astype(np.float32)
+                heading = np.where(rng.random(len(rows)) < OWN_SHARE, known.heading[rows], anywhere)
+                parts = threads.map(prepare, np.split(rows, supervised.SHARDS), np.split(heading, supervised.SHARDS))
+                for batch in zip(*(torch.cat(part).split(BATCH) for part in zip(*parts, strict=True)), strict=True):
+                    self._step(*batch)
+                    yield
+
+    def _step(self, before: torch.Tensor, after: torch.Tensor, reward: torch.Tensor) -> None:
+        """One gradient step on transitions: [s; e] before and after [m, ni], and the reward [m, 1]."""
+        wanted = policy.activations(self._target_layers, after)[-1].mul_(DISCOUNT).add_(reward)
+        self._vector.grad = supervised.gradient(self._layers, before, wanted, BATCH)
+        self._optimiser.step()
+        self._target.lerp_(self._vector, TARGET_RATE)
 
     def improved(self, snapshot: PolicySnapshot) -> Floats:
         """u* [n, nu] (m) at the rows of the newest transitions."""
