@@ -155,7 +155,8 @@ class ActionValue:
                 anywhere = rng.uniform(-np.pi, np.pi, len(rows)).astype(np.float32)
                 heading = np.where(rng.random(len(rows)) < OWN_SHARE, known.heading[rows], anywhere)
                 parts = threads.map(prepare, np.split(rows, supervised.SHARDS), np.split(heading, supervised.SHARDS))
-                for batch in zip(*(torch.cat(part).split(BATCH) for part in zip(*parts, strict=True)), strict=True):
+                prepared = (torch.cat(part).view(PREPARED_N, BATCH, -1) for part in zip(*parts, strict=True))
+                for batch in zip(*prepared, strict=True):
                     self._step(*batch)
                     yield
 
