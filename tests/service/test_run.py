@@ -7,6 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from t6gps.learner import value
 from t6gps.service import evaluation, run
 from t6gps.service.config import Config, load
 from t6gps.service.serial import SerialExecutor
@@ -111,6 +112,22 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
         trained(config, this, StopsAfter(config, **stop))
     trained(config, this, SerialExecutor(config))
     for found, expected in zip(kept(this), kept(uninterrupted), strict=True):
+        assert found == expected
+
+
+@pytest.mark.parametrize("stop", [{"episodes": 7}, {"phase": "backward_pass"}])
+def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: dict[str, Any]
+) -> None:
+    for name in ("STEPS", "FIRST_STEPS"):
+        monkeypatch.setattr(value, name, value.PREPARED_N)
+    config = load("flat-quick", [*TINY, "learner.value_from=1"])
+    whole, stopped = (catalog.create(tmp_path, name, config.to_json()) for name in ("whole", "stopped"))
+    trained(config, whole, SerialExecutor(config))
+    with pytest.raises(KeyboardInterrupt):
+        trained(config, stopped, StopsAfter(config, **stop))
+    trained(config, stopped, SerialExecutor(config))
+    for found, expected in zip(kept(stopped), kept(whole), strict=True):
         assert found == expected
 
 
