@@ -15,9 +15,6 @@ if "RAY_ADDRESS" not in os.environ:
     os.environ.setdefault("RAY_AUTH_TOKEN", secrets.token_hex(32))
     # Ray would run the workers at the lowest priority but four: on a busy machine they hardly start.
     os.environ.setdefault("RAY_worker_niceness", "0")
-    # An episode comes with the answer of its call; through the object store, of which it takes a page fault for every 4
-    # kB and a promise that it is kept, it would cost the cluster four times as much.
-    os.environ.setdefault("RAY_max_direct_call_object_size", str(4 * 2**20))
     os.environ.setdefault("RAY_task_events_report_interval_ms", "0")  # nobody asks for the history of calls
     # Processes that fit models wait for the next iteration. Ray would end them after a second, and a new one takes
     # longer to start than the fits take.

@@ -26,7 +26,7 @@ from t6gps.storage.records import Episode, EpisodePlan
 
 PLANS_PER_WORKER = 2
 BYTES_IN_FLIGHT = 2**30
-"""Episodes under way count with the size of the largest seen; an object store, if they lie there, is twice as large."""
+"""Half of the embedded object store: episodes under way count with the size of the largest seen."""
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
 START_DEADLINE_S = 180.0

@@ -1,6 +1,6 @@
 """A simulated large pool: what supervisor, ledger and committer cost per episode with 10, 100, 1000 workers.
 
-Supervisor, ledger, spool and Ray are the real ones, and so are the tables' sizes. A worker is only a
+Supervisor, ledger, spool and Ray's object store are the real ones, and so are the tables' sizes. A worker is only a
 slot in one of a few actor processes, which sleeps and then sends an episode of random numbers: a thousand processes
 with an interpreter each would need some 80 GB.
 """
@@ -41,7 +41,7 @@ EPISODE_S = 1.0
 NOTE = (
     f"pool_N_*: N simulated workers are slots of {PROCESSES_N} real Ray actors with {CPUS_PER_PROCESS} CPUs each; "
     f"a slot sleeps {EPISODE_S:g} s per episode, nothing is simulated, pulled or checked in it; "
-    "supervisor, ledger, committer and what Ray does are real"
+    "supervisor, ledger, committer and object store are real"
 )
 
 

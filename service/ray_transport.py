@@ -1,6 +1,6 @@
 """Workers as Ray actors that pull their weights, and the holder of these weights.
 
-A worker asks the holder for a policy when a plan names another than it has. Tables travel with the answer of a call and
+A worker asks the holder for a policy when a plan names another than it has. Tables travel through the object store and
 are read in place. What Ray cannot do for a process that hangs - show its stacks, end it although it is stopped - is
 done from outside: on this node by the transport itself, on another by a caretaker there.
 """
