@@ -41,9 +41,9 @@ COLUMNS = (*INPUTS, "rest_lengths", "target_direction", "frame_yaw_rad", "elemen
 *_, ACTION_N = LENGTHS = [schema.vector_length(schema.FRAMES.field(name)) or 0 for name in INPUTS]
 INPUTS_N = sum(LENGTHS)
 REMEMBERED_N = 3
-"""Iterations whose transitions are learned from; 25,000 transitions alone mislead the value."""
+"""Iterations whose transitions are learned from; six are no better."""
 DISCOUNT = 0.95
-"""Per control step: two seconds, about a flop or two."""
+"""Per control step: a horizon of two seconds."""
 HIDDEN = (128, 128)
 BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 1e-3
 """Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""

@@ -119,11 +119,11 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
             spool.append(episode)
             episodes[episode.summary["episode_id"][0].as_py()] = episode
             observer.progress(iteration, "sample", len(episodes), len(plans))
+        executor.hand_over([spool.path(number) for number in episodes])
     if not episodes:
         raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
     if config.run.pipelined and iteration + 1 < config.run.iterations:
         _sample_ahead(config, run, executor, iteration + 1)
-    executor.hand_over([spool.path(number) for number in episodes])
     for phase in PHASES:
         with _timed(durations, phase):
             for done, total in executor.learn(phase):
