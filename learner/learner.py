@@ -43,8 +43,8 @@ SEGMENTED = (Localization.SEGMENTS, Localization.TIME)
 """Localizations that fit the models of segment classes; the others leave the table `classes` empty."""
 SEEN_N = {"sensors": schema.SENSORS_N, "shape": schema.OBSERVATION_N}
 """Entries of an observation that the policy sees."""
-CHUNK = 256
-"""Sub-trajectories solved at once: their matrices stay in the cache. Chunks do not depend on each other, so they run on
+CHUNK = 64
+"""Sub-trajectories solved at once: their results stay in the cache. Chunks do not depend on each other, so they run on
 all cores, which the workers leave idle while the learner works (but for a pipelined run), with the same result."""
 
 

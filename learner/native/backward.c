@@ -2,7 +2,8 @@
  * The LQG backward pass along sub-trajectories, and the forward pass that predicts its gain: what learner/lqg.py states.
  *
  * The matrices are small (39 states, 24 actions), so that calls of a general library cost more than the arithmetic; here
- * they stay in the first cache. Every sum has one order: the same bits on every processor.
+ * they stay in the first cache. Every sum has one order and every term is added by a fused multiplication: the same bits
+ * on every processor that has it (since 2013).
  */
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
@@ -11,90 +12,98 @@
 #include <stdlib.h>
 #include <string.h>
 
-enum { LANES = 8 };
-typedef float lanes __attribute__((vector_size(LANES * sizeof(float))));
-typedef lanes unaligned __attribute__((aligned(sizeof(float))));
+#pragma GCC optimize("fp-contract=fast", "no-tree-loop-distribute-patterns")
+#define ALL_KINDS __attribute__((target_clones("avx512f", "fma", "default")))
 
-#define BOTH_KINDS __attribute__((target_clones("avx2", "default"))) /* without FMA: the same bits */
+enum { ROWS = 8, COLUMNS = 16 };
 
-/* Row-major matrices whose rows have `width` lanes, filled up with zeros; `system` has [Quu -Qux -qu]. */
+/*
+ * A time step works on one symmetric matrix, the quadratic form of (du, dx, 1) to be least over du:
+ *
+ *     Q = [Quu Qux qu]
+ *         [ .  Qxx qx]
+ *
+ * The elimination of du leaves [V v] in the place of [Qxx qx]. Matrices are row-major, their rows have `width` entries,
+ * a multiple of COLUMNS. Of Q only what lies on or above the diagonal counts, of V all. Products are made by ROWS rows at
+ * once, so that matrices have up to ROWS - 1 more rows than they need.
+ */
 struct work {
-    int nx, nu, nz, width, system_width, acting; /* acting: leading entries of x with a row of H that is not zero */
-    lanes *F, *V, *VF, *Q, *system, *next;
-    float *v, *q;
+    int nx, nu, nz, width, gains_width, acting; /* acting: leading entries of x with a row of H that is not zero */
+    float *F, *VF, *Q, *gains;                  /* F = [Fu Fx 0; 0 0 1] */
+    float *dz, *dx;
 };
 
-static int lanes_of(int n) { return (n + LANES - 1) / LANES; }
-
 /*
- * The first `width` lanes of C [rows, stride] = A B, where a(i, k) = a[i * row + k * column] and B is [inner, stride].
+ * C <- A B or, if `subtract`, C - A B for the rows first..end of C, where a(i, k) = a[i * row + k * column] and B is
+ * [inner, width]; if `upper`, only the tiles that reach the diagonal or lie above it.
  */
-BOTH_KINDS static void multiply(const float *a, int row, int column, int rows, int inner, const lanes *b, lanes *c,
-                                int width, int stride) {
-    for (int i = 0; i < rows; i += 2) {
-        const float *first = a + (size_t)i * row, *second = i + 1 < rows ? first + row : first;
-        lanes *to = c + (size_t)i * stride, *also = i + 1 < rows ? to + stride : to;
-        int at = 0;
-        for (; at + 4 <= width; at += 4) {
-            lanes s[8] = {{0}};
-            const lanes *from = b + at;
-            for (int k = 0; k < inner; k++, from += stride) {
-                const float x = first[k * column], y = second[k * column];
-                for (int j = 0; j < 4; j++) {
-                    s[j] += x * from[j];
-                    s[4 + j] += y * from[j];
-                }
-            }
-            for (int j = 0; j < 4; j++) to[at + j] = s[j], also[at + j] = s[4 + j];
-        }
-        for (; at < width; at++) {
-            lanes s = {0}, t = {0};
-            for (int k = 0; k < inner; k++) {
-                s += first[k * column] * b[k * stride + at];
-                t += second[k * column] * b[k * stride + at];
-            }
-            to[at] = s, also[at] = t;
-        }
-    }
-}
+typedef Py_ssize_t size; /* of an index that is multiplied: quicker than int where ints may wrap, as in Python's builds */
+typedef void product(float *C, const float *a, size row, size column, const float *B, size inner, size width, size first,
+                     size end, int upper, int subtract);
 
-BOTH_KINDS static float dot(const float *a, const float *b, int n) {
-    lanes sum = {0};
-    int i = 0;
-    for (; i + LANES <= n; i += LANES) sum += *(const unaligned *)(a + i) * *(const unaligned *)(b + i);
-    float total = 0;
-    for (int j = 0; j < LANES; j++) total += sum[j];
-    for (; i < n; i++) total += a[i] * b[i];
-    return total;
+#define PRODUCT(name, isa, lanes)                                                                                      \
+    __attribute__((target(isa))) static void name(float *C, const float *a, size row, size column, const float *B,     \
+                                                  size inner, size width, size first, size end, int upper,             \
+                                                  int subtract) {                                                      \
+        typedef float vector __attribute__((vector_size(lanes * sizeof(float))));                                      \
+        for (size i = first; i < end; i += ROWS)                                                                       \
+            for (size at = upper ? i / COLUMNS * COLUMNS : 0; at < width; at += lanes) {                               \
+                vector sum[ROWS] = {{0}};                                                                              \
+                for (size k = 0; k < inner; k++)                                                                       \
+                    for (size r = 0; r < ROWS; r++)                                                                    \
+                        sum[r] += a[(i + r) * row + k * column] * *(const vector *)(B + k * width + at);               \
+                for (size r = 0; r < ROWS; r++) {                                                                      \
+                    vector *to = (vector *)(C + (i + r) * width + at);                                                 \
+                    *to = subtract ? *to - sum[r] : sum[r];                                                            \
+                }                                                                                                      \
+            }                                                                                                          \
+    }
+
+PRODUCT(product_16, "avx512f", 16)
+PRODUCT(product_8, "fma", 8)
+PRODUCT(product_4, "sse2", 4)
+
+static product *multiply; /* the one for this processor */
+
+/* to <- to - factor from, from entry `first` of `width` on. */
+static inline __attribute__((always_inline)) void subtract_row(float *restrict to, float factor,
+                                                               const float *restrict from, size first, size width) {
+    for (size at = first / COLUMNS * COLUMNS; at < width; at += COLUMNS)
+        for (size j = 0; j < COLUMNS; j++) to[at + j] -= factor * from[at + j];
 }
 
 /*
- * Solves A X = B, given in rows [A B] of `width` lanes, B from lane `first` on: X takes the place of B and the Cholesky
- * factor U of A = U'U that of A's upper half. Returns 0 if A is not positive definite.
+ * Eliminates the first n unknowns from rows 0..end of Q: the first n rows become U^-T [A B], where A = U'U is their
+ * square part, and the others lose B'A^-1 B. Returns 0 if A is not positive definite.
  */
-BOTH_KINDS static int solve(lanes *system, int n, int first, int width) {
-    for (int k = 0; k < n; k++) {
-        lanes *pivot = system + (size_t)k * width;
-        const float *U = (float *)pivot;
-        if (!(U[k] > 0)) return 0;
-        const float scale = 1 / sqrtf(U[k]);
-        for (int j = k / LANES; j < width; j++) pivot[j] *= scale;
-        for (int i = k + 1; i < n; i++) {
-            lanes *row = system + (size_t)i * width;
-            for (int j = i / LANES; j < width; j++) row[j] -= U[i] * pivot[j];
+ALL_KINDS static int eliminate(float *Q, size n, size end, size width) {
+    for (size first = 0, next; first < n; first = next) {
+        next = first + ROWS < n ? first + ROWS : n;
+        for (size k = first; k < next; k++) {
+            float *restrict pivot = Q + k * width;
+            if (!(pivot[k] > 0)) return 0;
+            const float scale = 1 / sqrtf(pivot[k]);
+            for (size j = k / COLUMNS * COLUMNS; j < width; j++) pivot[j] *= scale;
+            for (size i = k + 1; i < next; i++) subtract_row(Q + i * width, pivot[i], pivot, i, width);
         }
-    }
-    for (int k = n - 1; k >= 0; k--) {
-        lanes *solved = system + (size_t)k * width;
-        const float scale = 1 / ((float *)solved)[k];
-        for (int j = first; j < width; j++) solved[j] *= scale;
-        for (int i = 0; i < k; i++) {
-            lanes *row = system + (size_t)i * width;
-            const float factor = ((float *)row)[k];
-            for (int j = first; j < width; j++) row[j] -= factor * solved[j];
-        }
+        const float *rows = Q + first * width;
+        multiply(Q, rows, 1, width, rows, next - first, width, next, end, 1, 1);
     }
     return 1;
+}
+
+/* Y <- U^-1 Y with Y [n, width] and U the upper half of rows of `stride` entries. */
+ALL_KINDS static void substitute(float *Y, size width, const float *U, size n, size stride) {
+    for (size next = n, first; next > 0; next = first) {
+        first = (next - 1) / ROWS * ROWS;
+        for (size k = next - 1; k >= first; k--) {
+            float *restrict solved = Y + k * width;
+            const float scale = 1 / U[k * stride + k];
+            for (size j = 0; j < width; j++) solved[j] *= scale;
+            for (size i = first; i < k; i++) subtract_row(Y + i * width, U[i * stride + k], solved, 0, width);
+        }
+        multiply(Y, U + first, stride, 1, Y + first * width, next - first, width, 0, first, 0, 1);
+    }
 }
 
 /* What is given and found along one sub-trajectory; all arrays contiguous, shapes in learner/lqg.py. */
@@ -105,62 +114,74 @@ struct problem {
     int length;
 };
 
-BOTH_KINDS static int backward(const struct problem *p, const struct work *w) {
-    const int nx = w->nx, nu = w->nu, nz = w->nz, width = w->width, stride = width * LANES;
-    const int first = lanes_of(nu), narrow = lanes_of(nx + 1), system_stride = w->system_width * LANES;
-    float *V = (float *)w->V, *Q = (float *)w->Q, *F = (float *)w->F;
-    memset(V, 0, sizeof(float) * nx * stride);
-    for (int i = 0; i < nx; i++) memcpy(V + i * stride, p->hessian + i * nx, sizeof(float) * nx);
-    memcpy(w->v, p->gradient + (size_t)(p->length - 1) * nx, sizeof(float) * nx);
+ALL_KINDS static int backward(const struct problem *p, const struct work *w) {
+    const size nx = w->nx, nu = w->nu, nz = w->nz, stride = w->width;
+    float *F = w->F, *Q = w->Q, *Qxx = Q + nu * (stride + 1), *gains = w->gains;
+    for (size i = 0; i < nx; i++) {
+        memcpy(Qxx + i * stride, p->hessian + i * nx, sizeof(float) * nx);
+        Qxx[i * stride + nx] = p->gradient[(size_t)(p->length - 1) * nx + i];
+    }
     for (int t = p->length - 1; t >= 0; t--) {
         const size_t m = (size_t)p->model[t];
         const float *precision = p->precision + m * nu, *precision_P = p->precision_P + m * nu * nx;
-        const float *deviation = p->deviation + (size_t)t * nu;
-        for (int i = 0; i < nx; i++) memcpy(F + i * stride, p->F + (m * nx + i) * nz, sizeof(float) * nz);
-        const int rank = t == p->length - 1 ? w->acting : nx; /* rows of V that are not zero */
-        multiply(V, stride, 1, rank, rank, w->F, w->VF, width, width);
-        multiply(F, 1, stride, nx, rank, w->VF, w->Q, lanes_of(nx), width); /* Qxx */
-        multiply(F + nx, 1, stride, nu, rank, w->VF, w->Q + nx * width, width, width); /* Qux Quu */
-        multiply(w->v, 0, 1, 1, nx, w->F, (lanes *)w->q, width, width);
-        float *Qux = Q + nx * stride;
-        for (int i = 0; i < nu; i++) {
-            float *row = (float *)w->system + i * system_stride, *restrict gains = row + first * LANES;
-            float *restrict Qux_i = Qux + i * stride;
+        const float *both = p->P_precision_P + m * nx * nx, *deviation = p->deviation + (size_t)t * nu;
+        for (size i = 0; i < nx; i++) {
+            const float *restrict from = p->F + (m * nx + i) * nz;
+            float *restrict to = F + i * stride;
+            for (size j = 0; j < nu; j++) to[j] = from[nx + j];
+            for (size j = 0; j < nx; j++) to[nu + j] = from[j];
+        }
+        multiply(w->VF, Qxx, stride, 1, w->F, nx + 1, stride, 0, nx, 0, 0);
+        multiply(Q, F, 1, stride, w->VF, nx, stride, 0, t ? nz : nu, 1, 0);
+        float *restrict v = w->dx;
+        for (size i = 0; i < nx; i++) v[i] = t ? p->gradient[(size_t)(t - 1) * nx + i] : 0;
+        for (size i = 0; i < nu; i++) {
+            float *restrict row = Q + i * stride, *restrict Qux = row + nu;
             const float *restrict precision_P_i = precision_P + i * nx;
-            memcpy(row, Qux_i + nx, sizeof(float) * nu);
+            const float weight = deviation[i];
             row[i] += precision[i];
-            for (int j = 0; j < nx; j++) gains[j] = -(Qux_i[j] -= precision_P_i[j]);
-            gains[nx] = -(w->q[nx + i] + precision[i] * deviation[i]);
+            for (size j = 0; j < nx; j++) {
+                Qux[j] -= precision_P_i[j];
+                v[j] -= weight * precision_P_i[j];
+            }
+            row[nz] += precision[i] * weight;
         }
-        if (!solve(w->system, nu, first, w->system_width)) return 0;
-        for (int i = 0; i < nu; i++) {
-            const float *gains = (float *)w->system + i * system_stride + first * LANES;
-            memcpy(p->K + ((size_t)t * nu + i) * nx, gains, sizeof(float) * nx);
-            p->k[(size_t)t * nu + i] = gains[nx];
-        }
-        if (t == 0) break;
-        multiply(Qux, 1, stride, nx, nu, w->system + first, w->next, narrow, w->system_width); /* Qxu [K k] */
-        const float *both = p->P_precision_P + m * nx * nx, *gradient = p->gradient + (size_t)(t - 1) * nx;
-        float *restrict v = w->v;
-        for (int i = 0; i < nx; i++) {
-            float *restrict V_i = V + i * stride;
-            const float *restrict Q_i = Q + i * stride, *restrict next = (float *)w->next + i * system_stride;
+        for (size i = 0; t && i < nx; i++) {
+            float *restrict row = Qxx + i * stride;
             const float *restrict both_i = both + i * nx, *restrict hessian = p->hessian + i * nx;
-            for (int j = 0; j < nx; j++) V_i[j] = Q_i[j] + both_i[j] + next[j] + hessian[j];
-            v[i] = w->q[i] + next[nx] + gradient[i];
+            for (size j = i; j < nx; j++) row[j] += both_i[j] + hessian[j];
+            row[nx] += v[i];
         }
-        for (int i = 0; i < nu; i++) {
-            const float *restrict precision_P_i = precision_P + i * nx;
-            for (int j = 0; j < nx; j++) v[j] -= deviation[i] * precision_P_i[j];
+        if (!eliminate(Q, nu, t ? nz : nu, stride)) return 0;
+        for (size i = 0; i < nu; i++) memcpy(gains + i * w->gains_width, Q + i * stride + nu, sizeof(float) * (nx + 1));
+        substitute(gains, w->gains_width, Q, nu, stride);
+        for (size i = 0; i < nu; i++) {
+            const float *from = gains + i * w->gains_width;
+            float *restrict K = p->K + ((size_t)t * nu + i) * nx;
+            for (size j = 0; j < nx; j++) K[j] = -from[j];
+            p->k[(size_t)t * nu + i] = -from[nx];
         }
+        for (size i = 1; i < nx; i++)
+            for (size j = 0; j < i; j++) Qxx[i * stride + j] = Qxx[j * stride + i];
     }
     return 1;
+}
+
+ALL_KINDS static float dot(const float *a, const float *b, int n) {
+    enum { PARTS = 8 };
+    float sum[PARTS] = {0}, total = 0;
+    int i = 0;
+    for (; i + PARTS <= n; i += PARTS)
+        for (int j = 0; j < PARTS; j++) sum[j] += a[i + j] * b[i + j];
+    for (int j = 0; j < PARTS; j++) total += sum[j];
+    for (; i < n; i++) total += a[i] * b[i];
+    return total;
 }
 
 /* What the improved policy changes in the running cost, by the models. */
 static void forward(const struct problem *p, const struct work *w) {
     const int nx = w->nx, nu = w->nu, nz = w->nz;
-    float *dz = w->q, *dx = w->v; /* [dx du] before a step, dx after it */
+    float *dz = w->dz, *dx = w->dx; /* [dx du] before a step, dx after it */
     memset(dz, 0, sizeof(float) * nx);
     for (int t = 0; t < p->length; t++) {
         const float *F = p->F + (size_t)p->model[t] * nx * nz, *gradient = p->gradient + (size_t)t * nx;
@@ -220,20 +241,22 @@ static Py_ssize_t run(const Py_buffer *a, struct work *w) {
     return -1;
 }
 
+/* Entries of a row for n. */
+static int padded(int n) { return (n + COLUMNS - 1) / COLUMNS * COLUMNS; }
+
 static PyObject *solve_all(const Py_buffer *a) {
     const int nx = (int)a[GRADIENT].shape[2], nu = (int)a[DEVIATION].shape[2], nz = nx + nu;
-    const int width = lanes_of(nz), system_width = lanes_of(nu) + lanes_of(nx + 1);
-    struct work w = {.nx = nx, .nu = nu, .nz = nz, .width = width, .system_width = system_width};
+    struct work w = {.nx = nx, .nu = nu, .nz = nz, .width = padded(nz + 1), .gains_width = padded(nx + 1)};
     const float *hessian = a[HESSIAN].buf;
     for (int i = 0; i < nx * nx; i++)
         if (hessian[i] != 0 && w.acting <= i / nx) w.acting = i / nx + 1;
-    const size_t lanes_n = (size_t)(3 * nx + nz + 2) * width + (size_t)nz * system_width;
-    lanes *memory = aligned_alloc(sizeof(lanes), lanes_n * sizeof(lanes));
+    const size_t F_n = (nx + 2) * w.width, VF_n = (nx + ROWS) * w.width, Q_n = (nz + ROWS + 1) * w.width;
+    const size_t bytes = sizeof(float) * (F_n + VF_n + Q_n + 2 * w.width + nu * w.gains_width);
+    float *memory = aligned_alloc(COLUMNS * sizeof(float), bytes);
     if (!memory) return PyErr_NoMemory();
-    memset(memory, 0, lanes_n * sizeof(lanes));
-    w.F = memory, w.V = w.F + nx * width, w.VF = w.V + nx * width, w.Q = w.VF + nx * width;
-    w.v = (float *)(w.Q + nz * width), w.q = w.v + width * LANES;
-    w.system = w.Q + (nz + 2) * width, w.next = w.system + nu * system_width;
+    memset(memory, 0, bytes);
+    w.F = memory, w.VF = w.F + F_n, w.Q = w.VF + VF_n, w.dz = w.Q + Q_n, w.dx = w.dz + w.width, w.gains = w.dx + w.width;
+    w.F[nx * w.width + nz] = 1;
     Py_ssize_t failed;
     Py_BEGIN_ALLOW_THREADS;
     failed = run(a, &w);
@@ -273,4 +296,7 @@ static PyMethodDef methods[] = {
 
 static struct PyModuleDef module = {PyModuleDef_HEAD_INIT, "_backward", NULL, -1, methods, NULL, NULL, NULL, NULL};
 
-PyMODINIT_FUNC PyInit__backward(void) { return PyModule_Create(&module); }
+PyMODINIT_FUNC PyInit__backward(void) {
+    multiply = __builtin_cpu_supports("avx512f") ? product_16 : __builtin_cpu_supports("fma") ? product_8 : product_4;
+    return PyModule_Create(&module);
+}
