@@ -156,10 +156,10 @@ def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
 
 
 @pytest.mark.parametrize("variance", [0.02, 0.0])
-@pytest.mark.parametrize("nx", [3, 39, 75])
-def test_a_plain_loop_in_double_precision_gives_the_same_to_four_digits(nx: int, variance: float) -> None:
-    """At sizes of the robot, 24 actions and 10 steps; also for a policy without noise, whose S has its floor."""
-    nu, length, b = 24, 10, 20
+@pytest.mark.parametrize(("nx", "nu"), [(3, 24), (39, 24), (75, 24), (16, 8), (7, 33), (6, 1)])
+def test_a_plain_loop_in_double_precision_gives_the_same_to_four_digits(nx: int, nu: int, variance: float) -> None:
+    """At sizes of the robot and others, 10 steps; also for a policy without noise, whose S has its floor."""
+    length, b = 10, 20
     rng = np.random.default_rng(0)
     F = rng.normal(0, 0.8 / np.sqrt(nx), (b, nx, nx + nu))  # spectral radius about 0.8
     F[:, -1:] = -F[:, -2:-1]  # dependent rows, as of nodes about the centre of mass
