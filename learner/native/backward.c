@@ -131,8 +131,8 @@ ALL_KINDS static int backward(const struct problem *p, const struct work *w) {
             for (size j = 0; j < nu; j++) to[j] = from[nx + j];
             for (size j = 0; j < nx; j++) to[nu + j] = from[j];
         }
-        multiply(w->VF, Qxx, stride, 1, w->F, nx + 1, stride, 0, nx, 0, 0);
-        multiply(Q, F, 1, stride, w->VF, nx, stride, 0, t ? nz : nu, 1, 0);
+        multiply(w->VF, Qxx, stride, 1, w->F, nx + 1, stride, 0, nx, 0, 0); /* [V v] F */
+        multiply(Q, F, 1, stride, w->VF, nx, stride, 0, t ? nz : nu, 1, 0); /* F' of it; at last only rows of du */
         float *restrict v = w->dx;
         for (size i = 0; i < nx; i++) v[i] = t ? p->gradient[(size_t)(t - 1) * nx + i] : 0;
         for (size i = 0; i < nu; i++) {
@@ -161,7 +161,8 @@ ALL_KINDS static int backward(const struct problem *p, const struct work *w) {
             for (size j = 0; j < nx; j++) K[j] = -from[j];
             p->k[(size_t)t * nu + i] = -from[nx];
         }
-        for (size i = 1; i < nx; i++)
+        if (t == 0) break;
+        for (size i = 1; i < nx; i++) /* V whole */
             for (size j = 0; j < i; j++) Qxx[i * stride + j] = Qxx[j * stride + i];
     }
     return 1;
