@@ -84,7 +84,7 @@ class Learner:
         self._run_seed = run_seed
         self._target_speed_m_per_s = target_speed_m_per_s
         self._vertical_weight = vertical_weight
-        self._command_range_m = command_range_m
+        self._command_range_m, self._reach_m = command_range_m, reach_m
         self._world_labels, self._mirrored = world_labels, mirrored
         self._fit_map = fit_map
         self._keeps_earlier = keeps_earlier
@@ -138,7 +138,7 @@ class Learner:
         else:
             rows = read_rows(self._episodes, self._settings.reduced_state)
         if self._value:
-            self._value.add(value.read(self._episodes, self._mirrored))
+            self._value.add(value.read(self._episodes, self._mirrored, self._reach_m))
         self._episodes.clear()
         self._fitted = self._improved = self._trained = None
         yield 1, 2
@@ -302,7 +302,8 @@ class Learner:
             return
         newest = self.snapshot.version
         for iteration in range(max(newest - value.REMEMBERED_N + 1, 0), newest):
-            self._value.add(value.read(tables.frames_of(run, iteration, value.COLUMNS), self._mirrored))
+            episodes = tables.frames_of(run, iteration, value.COLUMNS)
+            self._value.add(value.read(episodes, self._mirrored, self._reach_m))
 
 
 def _arrays(snapshot: PolicySnapshot, name: str) -> dict[str, NDArray[Any]]:

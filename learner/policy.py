@@ -58,10 +58,7 @@ def activations(layers: Layers, inputs: torch.Tensor) -> list[torch.Tensor]:
     values = [inputs]
     for number, (weight, bias) in enumerate(layers, 1):
         value = torch.addmm(bias, values[-1], weight.t())
-        if number < len(layers):
-            # tanh z = 2 sigmoid(2 z) - 1, at a third of the time that torch takes for tanh
-            value.mul_(2).sigmoid_().mul_(2).sub_(1)
-        values.append(value)
+        values.append(value.tanh_() if number < len(layers) else value)
     return values
 
 

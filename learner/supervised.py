@@ -2,29 +2,60 @@
 
     minimise over theta   mean | network_theta(y) - (u* - offset) / scale |^2
 
-from the current weights, by Adam with a step that decays to zero along half a cosine.
-
-Every batch is divided into SHARDS parts, whose gradients are added in a fixed order. The parts run on threads; each
-is computed as on one thread, so the result depends neither on the number of cores nor on which part is done first.
+from the current weights, by Adam with a step that decays to zero along half a cosine, on one thread: a gradient step is
+a millisecond of many small products, and two threads wait for each other longer than they save.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Generator
-from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import numpy as np
 import torch
 from numpy.typing import NDArray
+from torch.optim.adam import adam
 
 from t6gps.learner import policy
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.records import PolicySnapshot
 
-SHARDS, THREADS_PER_SHARD = 2, 1
-"""Fixed, since sums depend on how they are split: the same pairs must give the same weights on every machine."""
+
+class Moments(NamedTuple):
+    """What Adam remembers of earlier gradients: steps taken [], averages of the gradient and of its square [n]."""
+
+    step: torch.Tensor
+    exp_avg: torch.Tensor
+    exp_avg_sq: torch.Tensor
+
+
+def no_moments(parameters: torch.Tensor) -> Moments:
+    """Moments before the first step."""
+    return Moments(torch.zeros(()), torch.zeros_like(parameters), torch.zeros_like(parameters))
+
+
+def descend(
+    parameters: torch.Tensor, gradient: torch.Tensor, moments: Moments, rate: float, weight_decay: float = 0.0
+) -> None:
+    """One step of Adam, or AdamW, in place: torch's own, but for its optimiser class, which takes a second to load."""
+    adam(
+        [parameters],
+        [gradient],
+        [moments.exp_avg],
+        [moments.exp_avg_sq],
+        [],
+        [moments.step],
+        fused=True,
+        decoupled_weight_decay=True,
+        amsgrad=False,
+        maximize=False,
+        beta1=0.9,
+        beta2=0.999,
+        eps=1e-8,
+        lr=rate,
+        weight_decay=weight_decay,
+    )
 
 
 class Loss(NamedTuple):
@@ -46,29 +77,21 @@ def train(
     Yields (epochs done, epochs) and returns the next policy version with its loss. The result is a function of the
     arguments alone.
     """
-    torch.set_num_threads(THREADS_PER_SHARD)
+    torch.set_num_threads(1)
     inputs = torch.from_numpy(observations)
     targets = torch.from_numpy((actions - np.float32(snapshot.offset_m)) / np.float32(snapshot.scale_m))
     parameters, layers = policy.parameters(snapshot)
-    optimiser = torch.optim.Adam([parameters], fused=True)
+    moments = no_moments(parameters)
     batches = -(-len(inputs) // settings.batch)
-    steps, step = settings.epochs * batches, 0
+    steps = settings.epochs * batches
     before = _mean_squared_error(layers, inputs, targets)
-    with ThreadPoolExecutor(SHARDS) as threads:
-        for epoch in range(settings.epochs):
-            for batch in np.array_split(rng.permutation(len(inputs)), batches):
-
-                def shard_gradient(rows: NDArray[np.int64], batch_n: int = len(batch)) -> torch.Tensor:
-                    chosen = torch.from_numpy(rows)
-                    return gradient(layers, inputs[chosen], targets[chosen], batch_n)
-
-                parts = list(threads.map(shard_gradient, np.array_split(batch, SHARDS)))
-                parameters.grad = torch.stack(parts).sum(dim=0)
-                decay = (1 + math.cos(math.pi * step / steps)) / 2
-                optimiser.param_groups[0]["lr"] = settings.learning_rate * decay
-                optimiser.step()
-                step += 1
-            yield epoch + 1, settings.epochs
+    for epoch in range(settings.epochs):
+        order = torch.from_numpy(rng.permutation(len(inputs)))
+        for step, batch in enumerate(order.tensor_split(batches), epoch * batches):
+            decay = (1 + math.cos(math.pi * step / steps)) / 2
+            change = gradient(layers, inputs[batch], targets[batch], len(batch))
+            descend(parameters, change, moments, settings.learning_rate * decay)
+        yield epoch + 1, settings.epochs
     loss = Loss(before, _mean_squared_error(layers, inputs, targets))
     trained = tuple((weight.numpy().copy(), bias.numpy().copy()) for weight, bias in layers)
     return PolicySnapshot(snapshot.version + 1, trained, snapshot.offset_m, snapshot.scale_m), loss
@@ -85,7 +108,7 @@ def gradient(layers: policy.Layers, inputs: torch.Tensor, targets: torch.Tensor,
     for number in reversed(range(len(layers))):
         parts += [back.sum(dim=0), (back.t() @ entering[number]).reshape(-1)]
         if number:
-            back = (back @ layers[number][0]).mul_(1 - entering[number].square())
+            back = torch.ops.aten.tanh_backward(back @ layers[number][0], entering[number])
     return torch.cat(parts[::-1])
 
 

@@ -18,6 +18,7 @@ A command beyond the reach of its winch changes nothing in this step and stays.
 
 from __future__ import annotations
 
+import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
@@ -38,8 +39,10 @@ Floats = NDArray[np.float32]
 INPUTS = ("observation", "com_velocity", "node_velocities", "action")
 COLUMNS = (*INPUTS, "rest_lengths", "target_direction", "frame_yaw_rad", "element")
 """Columns of `frames` that the value is learned from, and of these what its network gets."""
-*_, ACTION_N = LENGTHS = [schema.vector_length(schema.FRAMES.field(name)) or 0 for name in INPUTS]
+OBSERVATION_N, *_, ACTION_N = LENGTHS = [schema.vector_length(schema.FRAMES.field(name)) or 0 for name in INPUTS]
 INPUTS_N = sum(LENGTHS)
+COM_VELOCITY, MOVED = slice(OBSERVATION_N, OBSERVATION_N + LENGTHS[1]), slice(INPUTS_N - ACTION_N, INPUTS_N)
+"""Where the velocity of the centre of mass is among them, and e."""
 REMEMBERED_N = 3
 """Iterations whose transitions are learned from; six are no better."""
 DISCOUNT = 0.95
@@ -47,8 +50,9 @@ DISCOUNT = 0.95
 HIDDEN = (128, 128)
 BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 1e-3
 """Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
+WEIGHT_DECAY = 0.01
 PREPARED_N = 30
-"""Gradient steps whose transitions are prepared at once, by both threads; a step alone is too small for two."""
+"""Gradient steps whose transitions are prepared at once."""
 TARGET_RATE = 0.005
 """The network in the temporal-difference target follows the learned one by this share per step."""
 OWN_SHARE = 0.5
@@ -61,17 +65,15 @@ ASCENTS, ASCENT_RATE = 4, 0.5
 class Transitions(NamedTuple):
     """Rows of the episodes of one iteration [n], in order.
 
-    observation    [n, ny];   velocities    of centre of mass and nodes [n, 39] (m/s);   rest_lengths [n, nu] (m)
-    action         commanded, noise included [n, nu] (m); zero in the last row of an episode
+    inputs         what Q sees, [s; e] [n, ni]; e is zero in the last row of an episode
+    rest_lengths   [n, nu] (m)
     turn, side     a horizontal direction of the world has the angle turn + side * angle in the frame of a row [n]
     heading        of the waypoint in the world [n] (rad)
     acts           the row has an action, and the row after it is what followed [n]
     """
 
-    observation: Floats
-    velocities: Floats
+    inputs: Floats
     rest_lengths: Floats
-    action: Floats
     turn: Floats
     side: Floats
     heading: Floats
@@ -82,27 +84,27 @@ class Transitions(NamedTuple):
         angle = self.turn[rows] + self.side[rows] * heading
         return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
-    def seen(self, rows: NDArray[np.int64], direction: Floats) -> torch.Tensor:
-        """What a policy sees in rows [m, ny] if the waypoint lies in a direction [m, 2]."""
-        observation = self.observation[rows]
-        observation[:, schema.TARGET] = direction
-        return torch.from_numpy(observation)
+    def towards(self, rows: NDArray[np.int64], direction: Floats) -> torch.Tensor:
+        """Inputs in rows [m, ni] if the waypoint lies in a direction [m, 2]."""
+        inputs = self.inputs[rows]
+        inputs[:, schema.TARGET] = direction
+        return torch.from_numpy(inputs)
 
 
-def read(episodes: Mapping[int, pa.Table], mirrored: NDArray[np.bool_]) -> Transitions:
+def read(episodes: Mapping[int, pa.Table], mirrored: NDArray[np.bool_], reach_m: float) -> Transitions:
     """Transitions of the `frames` tables in `episodes`; DataError as for `features.read_rows`.
 
-    `mirrored` [elements] says which symmetry elements mirror the world.
+    `mirrored` [elements] says which symmetry elements mirror the world; `reach_m` is as in `ActionValue`.
     """
     tables, acts, _ = acting_rows(episodes)
     table = pa.concat_tables([table.select(COLUMNS) for table in tables])
     *numbers, element = (schema.array(table, name) for name in COLUMNS)
-    observation, com, nodes, action, rest, target, turn = (np.asarray(part, dtype=np.float32) for part in numbers)
-    whole = np.zeros_like(rest)
-    whole[acts] = action
+    *state, action, rest, target, turn = (np.asarray(part, dtype=np.float32) for part in numbers)
+    moved = np.zeros_like(rest)
+    moved[acts] = np.clip((action - rest[acts]) / reach_m, -1, 1)
     side = np.where(mirrored[element], np.float32(-1), np.float32(1))
     heading = side * (np.arctan2(target[:, 1], target[:, 0]) - turn)
-    return Transitions(observation, np.hstack([com, nodes]), rest, whole, turn, side, heading, acts)
+    return Transitions(np.hstack([*state, moved]), rest, turn, side, heading, acts)
 
 
 class ActionValue:
@@ -120,13 +122,13 @@ class ActionValue:
         self._reach_m = reach_m
         self._vector, self._layers = policy.parameters(first)
         self._target, self._target_layers = policy.parameters(first)
-        self._optimiser = torch.optim.AdamW([self._vector], lr=LEARNING_RATE, fused=True)
+        self._moments = supervised.no_moments(self._vector)
         self._remembered: deque[Transitions] = deque(maxlen=REMEMBERED_N)
 
     @property
     def steps_n(self) -> int:
         """Gradient steps that `learn` will take."""
-        return STEPS if self._optimiser.state.get(self._vector) else FIRST_STEPS
+        return STEPS if self._moments.step else FIRST_STEPS
 
     def add(self, transitions: Transitions) -> None:
         """Take the transitions of one iteration; those of the oldest go."""
@@ -134,55 +136,48 @@ class ActionValue:
 
     def learn(self, snapshot: PolicySnapshot, rng: np.random.Generator) -> Iterator[None]:
         """Take `steps_n` gradient steps towards the value of a policy; yields after each."""
-        torch.set_num_threads(supervised.THREADS_PER_SHARD)
+        torch.set_num_threads(1)
         known = Transitions(*map(np.concatenate, zip(*self._remembered, strict=True)))
         index = np.flatnonzero(known.acts)
         mean = self._reward(known, index + 1, known.direction(index + 1, known.heading[index])).mean()
         act = _actor(snapshot)
-
-        def prepare(rows: NDArray[np.int64], heading: Floats) -> tuple[torch.Tensor, torch.Tensor, torch.Tensor]:
+        for _ in range(self.steps_n // PREPARED_N):
+            rows = rng.choice(index, PREPARED_N * BATCH)
+            anywhere = rng.uniform(-np.pi, np.pi, len(rows)).astype(np.float32)
+            heading = np.where(rng.random(len(rows)) < OWN_SHARE, known.heading[rows], anywhere)
             direction = known.direction(rows + 1, heading)
-            after, before = known.seen(rows + 1, direction), known.seen(rows, known.direction(rows, heading))
-            return (
-                self._inputs(known, rows, before, torch.from_numpy(known.action[rows])),
-                self._inputs(known, rows + 1, after, act(after)),
-                torch.from_numpy(self._reward(known, rows + 1, direction) - mean)[:, None],
-            )
-
-        with ThreadPoolExecutor(supervised.SHARDS) as threads:
-            for _ in range(self.steps_n // PREPARED_N):
-                rows = rng.choice(index, PREPARED_N * BATCH)
-                anywhere = rng.uniform(-np.pi, np.pi, len(rows)).astype(np.float32)
-                heading = np.where(rng.random(len(rows)) < OWN_SHARE, known.heading[rows], anywhere)
-                parts = threads.map(prepare, np.split(rows, supervised.SHARDS), np.split(heading, supervised.SHARDS))
-                prepared = (torch.cat(part).view(PREPARED_N, BATCH, -1) for part in zip(*parts, strict=True))
-                for batch in zip(*prepared, strict=True):
-                    self._step(*batch)
-                    yield
+            before = known.towards(rows, known.direction(rows, heading))
+            after = known.towards(rows + 1, direction)
+            after[:, MOVED] = self._moved(known, rows + 1, act(after))
+            reward = torch.from_numpy(self._reward(known, rows + 1, direction) - mean)
+            prepared = (part.view(PREPARED_N, BATCH, -1) for part in (before, after, reward))
+            for batch in zip(*prepared, strict=True):
+                self._step(*batch)
+                yield
 
     def _step(self, before: torch.Tensor, after: torch.Tensor, reward: torch.Tensor) -> None:
         """One gradient step on transitions: [s; e] before and after [m, ni], and the reward [m, 1]."""
         wanted = policy.activations(self._target_layers, after)[-1].mul_(DISCOUNT).add_(reward)
-        self._vector.grad = supervised.gradient(self._layers, before, wanted, BATCH)
-        self._optimiser.step()
+        change = supervised.gradient(self._layers, before, wanted, BATCH)
+        supervised.descend(self._vector, change, self._moments, LEARNING_RATE, WEIGHT_DECAY)
         self._target.lerp_(self._vector, TARGET_RATE)
 
     def improved(self, snapshot: PolicySnapshot) -> Floats:
         """u* [n, nu] (m) at the rows of the newest transitions."""
-        torch.set_num_threads(supervised.THREADS_PER_SHARD)
+        torch.set_num_threads(1)
         newest, act = self._remembered[-1], _actor(snapshot)
 
         def climb(rows: NDArray[np.int64]) -> torch.Tensor:
-            seen = torch.from_numpy(newest.observation[rows])
-            own = act(seen)
+            inputs = torch.from_numpy(newest.inputs[rows])
+            own = act(inputs)
             command = own.clone()
             for _ in range(ASCENTS):
-                slope = self._slope(self._inputs(newest, rows, seen, command))
-                command += ASCENT_RATE * (own + STEP_WEIGHT * slope - command)
+                inputs[:, MOVED] = self._moved(newest, rows, command)
+                command += ASCENT_RATE * (own + STEP_WEIGHT * self._slope(inputs) - command)
             return command
 
         n = len(newest.acts)
-        with ThreadPoolExecutor(supervised.SHARDS) as threads:
+        with ThreadPoolExecutor(os.cpu_count()) as threads:
             climbed = threads.map(climb, np.split(np.arange(n), range(policy.ROWS, n, policy.ROWS)))
             found: Floats = torch.cat(list(climbed)).numpy()
         return found
@@ -190,28 +185,24 @@ class ActionValue:
     def _reward(self, known: Transitions, rows: NDArray[np.int64], direction: Floats) -> Floats:
         """-cost / (2 v*) in rows [m] (m/s)."""
         speed = self._target_speed_m_per_s
-        spent = cost.running_cost(known.velocities[rows], direction, speed, self._vertical_weight)
+        spent = cost.running_cost(known.inputs[rows, COM_VELOCITY], direction, speed, self._vertical_weight)
         return (spent / (-2 * speed)).astype(np.float32)
 
-    def _inputs(
-        self, known: Transitions, rows: NDArray[np.int64], seen: torch.Tensor, command: torch.Tensor
-    ) -> torch.Tensor:
-        """[s; e] of rows [m] under commands [m, nu]."""
-        moved = ((command - torch.from_numpy(known.rest_lengths[rows])) / self._reach_m).clamp_(-1, 1)
-        return torch.cat([seen, torch.from_numpy(known.velocities[rows]), moved], dim=1)
+    def _moved(self, known: Transitions, rows: NDArray[np.int64], command: torch.Tensor) -> torch.Tensor:
+        """e [m, nu] of commands [m, nu] (m) in rows [m]."""
+        return ((command - torch.from_numpy(known.rest_lengths[rows])) / self._reach_m).clamp_(-1, 1)
 
     def _slope(self, inputs: torch.Tensor) -> torch.Tensor:
         """dQ/du [m, nu] (1/s): zero where the winch cannot reach."""
         values = policy.activations(self._layers, inputs)
         back = self._layers[-1][0].expand(len(inputs), -1)
         for number in reversed(range(len(HIDDEN))):
-            back = (back * (1 - values[number + 1].square())) @ self._layers[number][0]
-        moved = inputs[:, -ACTION_N:]
-        return back[:, -ACTION_N:].mul(moved.abs() < 1).div_(self._reach_m)
+            back = torch.ops.aten.tanh_backward(back, values[number + 1]) @ self._layers[number][0]
+        return back[:, MOVED].mul(inputs[:, MOVED].abs() < 1).div_(self._reach_m)
 
     def arrays(self) -> dict[str, NDArray[Any]]:
         """What the next iteration depends on, but for the transitions, which the run's tables hold."""
-        found = {"learned": self._vector, "target": self._target} | self._optimiser.state.get(self._vector, {})
+        found = {"learned": self._vector, "target": self._target} | self._moments._asdict()
         return {f"value_{name}": tensor.numpy().copy() for name, tensor in found.items()}
 
     def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
@@ -219,18 +210,16 @@ class ActionValue:
         self._remembered.clear()
         self._vector.copy_(torch.from_numpy(arrays["value_learned"]))
         self._target.copy_(torch.from_numpy(arrays["value_target"]))
-        self._optimiser.state.clear()
-        if "value_step" in arrays:
-            moments = {name: torch.from_numpy(arrays[f"value_{name}"]) for name in ("step", "exp_avg", "exp_avg_sq")}
-            self._optimiser.state[self._vector] = moments
+        names = supervised.Moments._fields
+        self._moments = supervised.Moments(*(torch.from_numpy(arrays[f"value_{name}"]) for name in names))
 
 
 def _actor(snapshot: PolicySnapshot) -> Callable[[torch.Tensor], torch.Tensor]:
-    """Rest lengths [m, nu] (m) that a policy commands without noise for observations [m, ny]."""
+    """Rest lengths [m, nu] (m) that a policy commands without noise where Q has the inputs [m, ni]."""
     _, layers = policy.parameters(snapshot)
     seen_n = layers[0][0].shape[1]
 
-    def act(seen: torch.Tensor) -> torch.Tensor:
-        return policy.activations(layers, seen[:, :seen_n])[-1].mul_(snapshot.scale_m).add_(snapshot.offset_m)
+    def act(inputs: torch.Tensor) -> torch.Tensor:
+        return policy.activations(layers, inputs[:, :seen_n])[-1].mul_(snapshot.scale_m).add_(snapshot.offset_m)
 
     return act

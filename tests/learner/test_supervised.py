@@ -103,22 +103,19 @@ def test_the_s_step_is_a_function_of_its_arguments() -> None:
     assert not same(run(first())[0], run(first(), seed=2)[0])
 
 
-def test_the_s_step_gives_the_same_bytes_whatever_part_of_a_batch_is_done_first(monkeypatch: Any) -> None:
-    class OneByOne:
-        """Runs everything at once in this thread, the last part first."""
-
-        def __init__(self, threads: int) -> None: ...
-        def __enter__(self) -> OneByOne:
-            return self
-
-        def __exit__(self, *error: object) -> None: ...
-        def map(self, function: Any, items: Any) -> list[Any]:
-            return [function(item) for item in reversed(items)][::-1]
-
-    expected = run(first())
-    monkeypatch.setattr(supervised, "ThreadPoolExecutor", OneByOne)
-    trained, loss = run(first())
-    assert same(trained, expected[0]) and loss == expected[1]
+def test_a_step_of_descent_is_that_of_torch() -> None:
+    """With and without weight decay, over steps that differ in their rate."""
+    rng = np.random.default_rng(0)
+    for decay in (0.0, 0.01):
+        ours = torch.from_numpy(rng.standard_normal(50).astype(np.float32))
+        theirs, moments = ours.clone(), supervised.no_moments(ours)
+        optimiser = torch.optim.AdamW([theirs], weight_decay=decay)
+        for rate in (1e-3, 2e-2, 5e-4):
+            change = torch.from_numpy(rng.standard_normal(50).astype(np.float32))
+            theirs.grad, optimiser.param_groups[0]["lr"] = change.clone(), rate
+            optimiser.step()
+            supervised.descend(ours, change, moments, rate, decay)
+        torch.testing.assert_close(ours, theirs)
 
 
 def test_a_warm_start_goes_on_where_it_stopped() -> None:

@@ -36,20 +36,23 @@ def planted(seed: int) -> value.Transitions:
     angle = turn + side * heading
     observation[:, schema.TARGET] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     rest = rng.uniform(0.9, 1.3, (n, 24)).astype(np.float32)
-    action = (rest + rng.normal(0, 0.1, rest.shape)).astype(np.float32)
-    e = np.clip((action - rest) / REACH_M, -1, 1)
+    e = np.clip(rng.normal(0, 0.1, rest.shape).astype(np.float32) / np.float32(REACH_M), -1, 1)
     course = side * (np.arctan2(e[:, LEFT], e[:, AHEAD]) - turn)  # in the world
     after = turn[1:] + side[1:] * course[:-1]
     velocities = rng.normal(0, 0.1, (n, 39)).astype(np.float32)
     speed = 0.5 * np.hypot(e[:-1, LEFT], e[:-1, AHEAD])
     velocities[1:, :2] += (speed * np.array([np.cos(after), np.sin(after)])).T
     acts = np.arange(n) % ROWS_N != ROWS_N - 1
-    return value.Transitions(observation, velocities, rest, action, turn, side, heading, acts)
+    return value.Transitions(np.hstack([observation, velocities, e]), rest, turn, side, heading, acts)
 
 
 def untrained() -> PolicySnapshot:
     rng = np.random.default_rng(1)
     return policy.initial(schema.OBSERVATION_N, 24, (16,), rng, offset_m=1.088, scale_m=0.2)
+
+
+def own_commands(transitions: value.Transitions) -> value.Floats:
+    return policy.act(untrained(), transitions.inputs[:, : schema.OBSERVATION_N])
 
 
 def learned(transitions: value.Transitions) -> value.ActionValue:
@@ -71,10 +74,10 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
 
 def test_improved_actions_move_the_winches_that_drive_and_no_others(found: value.ActionValue) -> None:
     transitions = planted(0)
-    own = policy.act(untrained(), transitions.observation)
+    own = own_commands(transitions)
     moved = found.improved(untrained()) - own
     within = np.abs(own - transitions.rest_lengths) < REACH_M / 2
-    for winch, along in zip((AHEAD, LEFT), transitions.observation[:, schema.TARGET].T, strict=True):
+    for winch, along in zip((AHEAD, LEFT), transitions.inputs[:, schema.TARGET].T, strict=True):
         clear = within & (np.abs(along) > 0.3)[:, None]
         signed = moved * np.sign(along)[:, None]
         assert (signed > 0)[clear[:, winch], winch].mean() > 0.95
@@ -83,7 +86,7 @@ def test_improved_actions_move_the_winches_that_drive_and_no_others(found: value
 
 
 def test_a_command_beyond_the_reach_of_its_winch_stays(found: value.ActionValue) -> None:
-    transitions, own = planted(0), policy.act(untrained(), planted(0).observation)
+    transitions, own = planted(0), own_commands(planted(0))
     beyond = np.abs(own - transitions.rest_lengths) > REACH_M
     assert 0.3 < beyond.mean() < 0.9
     assert np.array_equal(found.improved(untrained())[beyond], own[beyond])
@@ -93,14 +96,15 @@ def test_the_slope_is_that_of_the_value(found: value.ActionValue) -> None:
     transitions, rows = planted(5), np.arange(50)
     rest = torch.from_numpy(transitions.rest_lengths[rows])
     command = rest + REACH_M * torch.linspace(-2, 2, 24).roll(3)
-    seen = torch.from_numpy(transitions.observation[rows])
+    inputs = torch.from_numpy(transitions.inputs[rows])
 
     def q(command: torch.Tensor) -> torch.Tensor:
-        inputs = found._inputs(transitions, rows, seen, command).double()
+        inputs[:, value.MOVED] = found._moved(transitions, rows, command)
         layers = [(weight.double(), bias.double()) for weight, bias in found._layers]
-        return policy.activations(layers, inputs)[-1][:, 0]
+        return policy.activations(layers, inputs.double())[-1][:, 0]
 
-    slope = found._slope(found._inputs(transitions, rows, seen, command))
+    q(command)
+    slope = found._slope(inputs)
     for winch in range(24):
         step = torch.zeros(24)
         step[winch] = 1e-3
@@ -111,7 +115,7 @@ def test_the_slope_is_that_of_the_value(found: value.ActionValue) -> None:
 def test_the_last_row_of_an_episode_is_no_transition(found: value.ActionValue) -> None:
     """What stands in it besides its state is never read: poison it."""
     poisoned = planted(0)
-    poisoned.action[~poisoned.acts] = np.nan
+    poisoned.inputs[~poisoned.acts, value.MOVED] = np.nan
     assert same(learned(poisoned).arrays(), found.arrays())
 
 
@@ -153,12 +157,14 @@ def with_motion(table: pa.Table, seed: int) -> pa.Table:
 
 def test_what_is_read_of_an_episode_gives_back_its_columns(tables: list[pa.Table]) -> None:
     table, mirrored = with_motion(tables[0], 1), np.arange(24) % 2 == 1
-    found = value.read({0: table}, mirrored)
+    found = value.read({0: table}, mirrored, REACH_M)
     rows, target = np.arange(table.num_rows), schema.array(table, "target_direction")
     assert np.allclose(found.direction(rows, found.heading), target, atol=1e-5)
-    assert np.array_equal(found.action[:-1], schema.array(table, "action"))
+    moved = (schema.array(table, "action") - schema.array(table, "rest_lengths")[:-1]) / REACH_M
+    assert np.allclose(found.inputs[:-1, value.MOVED], np.clip(moved, -1, 1), atol=1e-5)
+    assert np.array_equal(found.inputs[:, value.COM_VELOCITY], schema.array(table, "com_velocity"))
     across = found.direction(rows, found.heading + np.float32(np.pi / 2))
-    assert np.array_equal(found.seen(rows, across)[:, schema.TARGET].numpy(), across)
+    assert np.array_equal(found.towards(rows, across)[:, schema.TARGET].numpy(), across)
     sign = target[:, 0] * across[:, 1] - target[:, 1] * across[:, 0]  # a mirrored frame sees the other side
     assert np.allclose(sign, np.where(mirrored[schema.array(table, "element")], -1, 1), atol=1e-5)
 
