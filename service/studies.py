@@ -147,6 +147,8 @@ BEYOND = {
 CHANGED_WORLDS = {
     "flat": ("terrain.difficulty=0",),
     "half-rough": ("terrain.difficulty=0.5",),
+    "steeper": ("terrain.difficulty=1.25",),
+    "steepest": ("terrain.difficulty=1.5",),
     "incline-10": ("terrain.difficulty=0", "terrain.tilt_deg=10"),
     "incline-18": ("terrain.difficulty=0", "terrain.tilt_deg=18"),
     "incline-26": ("terrain.difficulty=0", "terrain.tilt_deg=26"),

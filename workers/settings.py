@@ -3,6 +3,7 @@
 from pydantic import Field, model_validator
 
 from t6gps.storage.settings import Settings
+from t6gps.workers.terrain import STEEPEST_DIFFICULTY
 
 
 class RobotSettings(Settings):
@@ -32,7 +33,9 @@ class RobotSettings(Settings):
 class TerrainSettings(Settings):
     """Ground of an episode."""
 
-    difficulty: float = Field(0.0, ge=0.0, le=1.0, description="0 flat, 1 the paper's 38 deg / 16 deg / 1.55 m")
+    difficulty: float = Field(
+        0.0, ge=0.0, le=STEEPEST_DIFFICULTY, description="0 flat, 1 the paper's 38 deg / 16 deg / 1.55 m"
+    )
     tilt_deg: float = Field(0.0, ge=0.0, le=35.0, description="slope of the whole ground, rising towards +x (deg)")
     size_m: float = Field(40.0, ge=34.0, le=100.0, description="width of the ground; the plane has no end (m)")
     file: str = Field("", description="height map (.npy, .png) or surface (.stl, .obj) in place of random hills")

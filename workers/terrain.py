@@ -18,6 +18,8 @@ CELL_M = 0.5
 BLUR_STD_M = 0.41
 HEIGHT_STD_M = 0.50
 LARGEST_HEIGHT_M = 0.775
+STEEPEST_DIFFICULTY = 1.5
+"""Slopes of 48 deg on average, heights over a range of 2.3 m."""
 
 
 @dataclass(frozen=True)
@@ -81,11 +83,12 @@ def _blurred_noise(rng: np.random.Generator, n: int) -> Array:
 def generate(seed: int, difficulty: float, size_m: float = 40.0) -> Terrain:
     """The ground of a seed: flat at difficulty 0, the paper's at 1.
 
-    Raises TerrainError for a difficulty outside [0, 1] or a size outside [0.5, 100] m.
+    Raises TerrainError for a difficulty outside [0, 1.5] or a size outside [0.5, 100] m.
     """
-    if not 0.0 <= difficulty <= 1.0:
+    if not 0.0 <= difficulty <= STEEPEST_DIFFICULTY:
         raise TerrainError(
-            f"terrain.difficulty must lie in [0, 1], got {difficulty}; 0 is flat, 1 has the paper's 38 deg slopes"
+            f"terrain.difficulty must lie in [0, {STEEPEST_DIFFICULTY}], got {difficulty}; "
+            "0 is flat, 1 has the paper's 38 deg slopes"
         )
     if not CELL_M <= size_m <= 100.0:
         raise TerrainError(f"the ground must be {CELL_M} to 100 m wide, got {size_m}; the default is 40")

@@ -64,7 +64,7 @@ def test_an_override_reaches_its_key(override: str, section: str, key: str, valu
         ("run.episodes=1.5", ["run.episodes", "1.5"]),
         ("robot.friction=true", ["robot.friction", "number", "True"]),
         ("robot.friction=nan", ["robot.friction", "nan"]),
-        ("terrain.difficulty=2", ["terrain.difficulty", "less than or equal to 1", "2"]),
+        ("terrain.difficulty=2", ["terrain.difficulty", "less than or equal to 1.5", "2"]),
         ("learner.reduced_state=knees", ["learner.reduced_state", "nodes+vels", "knees"]),
         ("run.seed", ["--set takes key=value", "run.seed"]),
         ("run.seed.deep=1", ["run.seed"]),
