@@ -11,7 +11,7 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Generator, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from typing import Any, TypeVar
 
@@ -184,8 +184,15 @@ class Learner:
             for length, starts in lqg.sub_trajectories(rows.continues, settings.horizon_steps).items()
             for first in range(0, len(starts), CHUNK)
         ]
-        total = sum(map(len, chunks))
-        climbed = yield from self._climb_value(total)
+        leading = self._value if self.snapshot.version >= settings.value_from else None
+        sub_trajectories_n = sum(map(len, chunks))
+        done, total = 0, sub_trajectories_n + (leading.steps_n if leading else 0)
+        climbed: NDArray[np.float32] | None = None
+        if leading:
+            for _ in leading.learn(self.snapshot, self._rng(self.snapshot.version, VALUE_STREAM)):
+                done += 1
+                yield done, total
+            climbed = np.clip(leading.improved(self.snapshot), *self._command_range_m)
 
         def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
             given = models, patch.of_row[steps], gradient[steps + 1], hessian
@@ -195,24 +202,13 @@ class Learner:
             result = lqg.backward_pass(*given, deviation[steps])
             return result.k, result.predicted_cost_change
 
-        done = 0
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             for steps, (k, change) in zip(chunks, threads.map(improve, chunks), strict=True):
                 improved[steps], predicted[steps] = rows.action[steps] + k, change
                 done += len(steps)
                 yield done, total
         improved = np.clip(improved, *self._command_range_m).astype(np.float32)
-        self._improved = Improved(improved, predicted, total)
-
-    def _climb_value(self, sub_trajectories_n: int) -> Generator[tuple[int, int], None, NDArray[np.float32] | None]:
-        """Improved actions by the action value, None while it does not lead yet."""
-        version = self.snapshot.version
-        if self._value is None or version < self._settings.value_from:
-            return None
-        total = self._value.steps_n + sub_trajectories_n
-        for done, _ in enumerate(self._value.learn(self.snapshot, self._rng(version, VALUE_STREAM)), 1):
-            yield done, total
-        return np.clip(self._value.improved(self.snapshot), *self._command_range_m)
+        self._improved = Improved(improved, predicted, sub_trajectories_n)
 
     def _deviation(self, rows: Rows, patch: surrogate.Patch) -> tuple[NDArray[np.float32], float | None]:
         """Recorded action minus policy mean [n, nu], and the exploration variance if it is to replace the fitted S."""

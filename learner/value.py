@@ -48,7 +48,7 @@ REMEMBERED_N = 3
 DISCOUNT = 0.95
 """Per control step: a horizon of two seconds."""
 HIDDEN = (128, 128)
-BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 512, 600, 1800, 1e-3
+BATCH, STEPS, FIRST_STEPS, LEARNING_RATE = 256, 600, 1800, 1e-3
 """Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
 WEIGHT_DECAY = 0.01
 PREPARED_N = 30

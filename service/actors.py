@@ -5,6 +5,7 @@ Ray restarts nothing: `pool` replaces workers, the transport replaces the holder
 
 from __future__ import annotations
 
+import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
@@ -41,7 +42,12 @@ class LearnerActor:
             self._learner.add(spool.read(path).frames)
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        yield from getattr(self._learner, phase)()
+        """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""
+        told_s = -math.inf
+        for done, total in getattr(self._learner, phase)():
+            if done == total or time.monotonic() - told_s >= control.TICK_S:
+                told_s = time.monotonic()
+                yield done, total
 
     def ask(self, method: str, *arguments: Any) -> Any:
         return getattr(self._learner, method)(*arguments)

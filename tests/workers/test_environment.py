@@ -194,7 +194,7 @@ def test_an_action_that_is_not_24_finite_numbers_is_refused(environment: SuperBa
 def test_unknown_options_and_difficulties_are_refused(environment: SuperBallEnvironment) -> None:
     with pytest.raises(DataError, match="terrain_seed, found ground"):
         environment.reset(options={"ground": 3})
-    with pytest.raises(ValueError, match="less than or equal to 1.5"):
+    with pytest.raises(ValueError, match=r"less than or equal to 1\.5"):
         SuperBallEnvironment(terrain=TerrainSettings(difficulty=1.6))
 
 
