@@ -70,17 +70,11 @@ PAPER_SEEDS = 3
 PAPER_COST = ("task.target_speed_m_per_s=0.8", "learner.kl_weight=0.02")
 PAPER_NETWORK = ("learner.hidden_layers=[256, 256, 256]",)
 PAPER_OBSERVATION = ("learner.observation=sensors",)
-AS_IN_THE_PAPER = (
-    *PAPER_COST,
-    *PAPER_NETWORK,
-    *PAPER_OBSERVATION,
-    "exploration.quiet_share=0",
-    "learner.replay_iterations=1",
-    "learner.value_from=0",
-    "run.iterations=5",
-)
+NO_VALUE = ("learner.value_from=0", "learner.replay_iterations=1", "run.iterations=5")
+"""The backward pass throughout, replay, and the paper's number of iterations, where a preset has an action value."""
+AS_IN_THE_PAPER = (*PAPER_COST, *PAPER_NETWORK, *PAPER_OBSERVATION, *NO_VALUE, "exploration.quiet_share=0")
 """Cost, network, observation, exploration and iterations of the paper (Sec. IV-A, IV-C), under which its claims are
-checked; replay, as by default, which the preset rough does without, and no action value.
+checked, and replay.
 
 The KL term weighs as much beside the gradient of the cost as it does by default.
 """
@@ -111,6 +105,7 @@ REDUCED_STATES = ("com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables")
 
 FROM_REST = ("task.directions=36", "run.steps=16")
 STANDARD_GPS = (
+    *NO_VALUE,
     *FROM_REST,
     "run.iterations=10",
     "run.evaluation_episodes=36",
@@ -203,7 +198,7 @@ STUDIES = {
             "GPS learns from one rest state, in 36 directions, for 16 steps."
         ),
         arms={
-            "t6gps": Arm("T6-GPS", "flat ground", "flat", sizes={Scale.PAPER: ("run.episodes=100",)}),
+            "t6gps": Arm("T6-GPS", "flat ground", "flat", NO_VALUE, sizes={Scale.PAPER: ("run.episodes=100",)}),
             **{
                 name: Arm(label, "flat ground", "flat", (*STANDARD_GPS, *overrides), sizes=STANDARD_SIZES)
                 for name, label, overrides in (
@@ -238,7 +233,7 @@ STUDIES = {
             "quiet episodes change?"
         ),
         arms={
-            f"{name}-{ground}": Arm(label, f"{ground} ground", preset, overrides)
+            f"{name}-{ground}": Arm(label, f"{ground} ground", preset, (*NO_VALUE, *overrides))
             for ground, preset in (("flat", "flat"), ("rough", "rough-quick"))
             for name, (label, overrides) in BEYOND.items()
         },
@@ -252,6 +247,19 @@ STUDIES = {
             "backward-pass": Arm(
                 "backward pass throughout", "rough ground", "rough", ("learner.value_from=0",), sizes=ROUGH_SIZES
             ),
+            "flat-value": Arm(
+                "T6-GPS",
+                "flat ground",
+                "flat-fast",
+                sizes={Scale.PAPER: ("run.iterations=10", "run.episodes=50")},
+            ),
+            "flat-backward-pass": Arm(
+                "backward pass throughout",
+                "flat ground",
+                "flat-fast",
+                NO_VALUE,
+                sizes={Scale.QUICK: ("run.episodes=80",), Scale.PAPER: ("run.episodes=100",)},
+            ),
         },
         quick=("run.episodes=40",),
         quick_seeds=3,
@@ -262,7 +270,7 @@ STUDIES = {
             "loop cannot steer: the condition one-way, from rest along +x, is the one its gait was evolved for."
         ),
         arms={
-            label.split()[0].lower(): Arm(label, "flat ground", "flat", peer=peer)
+            label.split()[0].lower(): Arm(label, "flat ground", "flat", NO_VALUE, peer=peer)
             for label, peer in (
                 ("T6-GPS", None),
                 ("flop gait", Peer.FLOP),

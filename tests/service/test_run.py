@@ -21,6 +21,7 @@ TINY = [
     "run.steps=30",
     "learner.smallest_class_segments=4",
     "learner.epochs=2",
+    "learner.replay_iterations=1",
     "learner.hidden_layers=[16]",
 ]
 

@@ -22,6 +22,7 @@ SETTINGS = [
     "run.episodes=12",
     "exploration.noise_std_m=0.6",
     "learner.localization=time",
+    "learner.value_from=0",
     "learner.horizon_steps=30",
     "learner.longest_segment_steps=30",
     "learner.smallest_class_segments=1",
@@ -90,4 +91,4 @@ def test_every_direction_is_a_class_and_every_time_step_a_model(
 
 def test_standard_gps_without_a_common_start_is_refused() -> None:
     with pytest.raises(ConfigError, match=r"learner.localization = time needs a common start"):
-        load("flat-quick", ["learner.localization=time"])
+        load("flat-quick", ["learner.localization=time", "learner.value_from=0"])

@@ -203,7 +203,7 @@ def test_a_peer_is_evaluated_on_the_episodes_of_its_run_and_kept(
     monkeypatch.setattr(peers, "PPO_OPTIONS", {"n_steps": 125, "batch_size": 125, "n_epochs": 1, "device": "cpu"})
     one = Study(
         question="",
-        arms={"peer": Arm("peer", "flat", "flat-quick", peer=peer)},
+        arms={"peer": Arm("peer", "flat", "flat-quick", ("learner.value_from=0",), peer=peer)},
         quick=("run.iterations=1", "run.episodes=5", "run.steps=250", "run.evaluation_episodes=2"),
         quick_seeds=1,
         figures=("conditions",),
@@ -223,7 +223,7 @@ def test_a_peer_is_evaluated_on_the_episodes_of_its_run_and_kept(
 
 
 def test_the_workers_command_what_ppo_commands_on_average() -> None:
-    settings = config.load("flat-quick")
+    settings = config.load("flat-quick", ["learner.value_from=0"])
     model = peers.new_ppo(settings)
     learner = new_learner(settings)
     learner.restore(*peers.learner_state(model, settings))
