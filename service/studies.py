@@ -168,7 +168,7 @@ CHANGED_WORLDS = {
 STUDIES = {
     "surrogate": Study(
         question="Which reduced state lets the surrogate models lower the cost (paper Sec. V-B, left figure)?",
-        arms=_arms({state: (f"learner.reduced_state={state}",) for state in REDUCED_STATES}, (SHRUNK,)),
+        arms=_arms({state: (f"learner.reduced_state={state}",) for state in REDUCED_STATES}, (SHRUNK, PLAIN)),
         quick=("run.episodes=30",),
         quick_seeds=2,
     ),
@@ -181,7 +181,9 @@ STUDIES = {
     ),
     "horizon": Study(
         question="How long must sub-trajectories be (paper Sec. V-B: 10 to 20 steps alike, 5 worse)?",
-        arms=_arms({f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}, (SHRUNK,)),
+        arms=_arms(
+            {f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}, (SHRUNK, PLAIN)
+        ),
         quick=("run.episodes=40",),
         quick_seeds=2,
     ),
