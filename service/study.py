@@ -29,8 +29,8 @@ from t6gps.storage.errors import ConfigError, RunError
 
 ORIGIN = "origin.json"
 """Beside a run's tables: study, arm and seed, the commits that worked on it, and the seconds they took."""
-SECONDS_PER_STEP = {True: 0.0011, False: 0.0007}
-SECONDS_PER_RUN, SECONDS_PER_CONDITION = 15.0, 6.0
+SECONDS_PER_STEP = {True: 0.0005, False: 0.0003}
+SECONDS_PER_RUN, SECONDS_PER_CONDITION = 10.0, 5.0
 """Of two idle cores, on rough and on flat ground, learning included; to start and to draw (for the estimate alone)."""
 
 
