@@ -3,7 +3,7 @@
     minimise over theta   mean | network_theta(y) - (u* - offset) / scale |^2
 
 from the current weights, by Adam with a step that decays to zero along half a cosine, on one thread: a gradient step is
-a millisecond of many small products, and two threads wait for each other longer than they save.
+a millisecond of many small products, in which two threads mostly wait for each other.
 """
 
 from __future__ import annotations
