@@ -165,6 +165,7 @@ class RayExecutor(Executor):
         try:
             self.pool.close(*(("DONE", "") if self.finished else ("STOPPING", "the run was stopped")))
         finally:
+            self._transport.close()
             ray.shutdown()
             for number, handler in previous.items():
                 signal.signal(number, handler)

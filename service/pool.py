@@ -26,7 +26,7 @@ from t6gps.storage.records import Episode, EpisodePlan
 
 PLANS_PER_WORKER = 2
 BYTES_IN_FLIGHT = 2**30
-"""Half of the embedded object store: episodes under way count with the size of the largest seen."""
+"""Episodes under way count with the size of the largest seen."""
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
 START_DEADLINE_S = 180.0
@@ -178,7 +178,7 @@ class Pool:
         else:
             self._times.add(took_s, done.plan.steps)
             self._slots[worker.slot].failures_n = 0
-            self._largest_bytes = max(self._largest_bytes, done.result.frames.nbytes)
+            self._largest_bytes = max(self._largest_bytes, done.result.nbytes)
             if self.ledger.arrive(done.plan):
                 self._arrived.append((done.plan.episode_id, done.result))
 

@@ -1,13 +1,12 @@
 """A simulated large pool: what supervisor, ledger and committer cost per episode with 10, 100, 1000 workers.
 
-Supervisor, ledger, spool and Ray's object store are the real ones, and so are the tables' sizes. A worker is only a
+Supervisor, ledger, spool and the lines between are the real ones, and so are the tables' sizes. A worker is only a
 slot in one of a few actor processes, which sleeps and then sends an episode of random numbers: a thousand processes
 with an interpreter each would need some 80 GB.
 """
 
 from __future__ import annotations
 
-import asyncio
 import os
 import socket
 import tempfile
@@ -20,19 +19,19 @@ import numpy as np
 import pyarrow as pa
 import ray
 
-from t6gps.service import seeding
-from t6gps.service.cluster import join_or_start
+from t6gps.service import channel, seeding
+from t6gps.service.channel import Address
+from t6gps.service.cluster import join_or_start, this_node
 from t6gps.service.config import Config
 from t6gps.service.control import Control
 from t6gps.service.ledger import Ledger
 from t6gps.service.pool import Pool
 from t6gps.service.pool_contenders import Job, Tally, steps_of
-from t6gps.service.processes import Process
-from t6gps.service.ray_transport import Answer, RayTransport, Remote
+from t6gps.service.ray_transport import Answer, Greeting, RayTransport, Remote
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.transport import Identity
 from t6gps.storage import ipc
-from t6gps.storage.records import Episode, EpisodePlan
+from t6gps.storage.records import EpisodePlan
 from t6gps.storage.spool import Spool
 from t6gps.workers import stub
 
@@ -41,42 +40,35 @@ EPISODE_S = 1.0
 NOTE = (
     f"pool_N_*: N simulated workers are slots of {PROCESSES_N} real Ray actors with {CPUS_PER_PROCESS} CPUs each; "
     f"a slot sleeps {EPISODE_S:g} s per episode, nothing is simulated, pulled or checked in it; "
-    "supervisor, ledger, committer and object store are real"
+    "supervisor, ledger, committer and the lines between are real"
 )
 
 
 class SlotsActor:
-    """Many workers in one process: each call sleeps in turn with the others of its slot."""
+    """Many workers in one process: each is a thread that sleeps."""
 
     def __init__(self, job: Job) -> None:
         self._whole = stub.episode(job.plans[0], job.snapshot)
-        self._turns: dict[int, asyncio.Lock] = {}
+        self._greeting = Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
 
-    async def open(self, slot: int) -> tuple[Identity, Process | None, str]:
-        """Make a slot; as WorkerActor.open, but with no process to kill with it."""
-        self._turns[slot] = asyncio.Lock()
-        return Identity(os.getpid(), socket.gethostname(), ""), None, ray.get_runtime_context().get_node_id()
+    def work(self, address: Address) -> None:
+        """As WorkerActor.work: sleep for each plan, then send the same numbers under its number."""
+        with channel.connect(address) as line:
+            channel.send(line, self._greeting)
+            while True:
+                asked, _ = channel.receive(line)
+                if isinstance(asked, EpisodePlan):
+                    time.sleep(EPISODE_S)
+                    tables = (_renumbered(table, asked) for table in (self._whole.frames, self._whole.summary))
+                    channel.send(line, Answer(asked), ipc.pack(*tables))
+                elif asked is None:
+                    channel.send(line, None)
 
-    async def ping(self) -> None:
-        """A sign of life."""
 
-    async def run(self, slot: int, plan: EpisodePlan) -> Answer:
-        """Sleep, then send the same numbers under the plan's number."""
-        async with self._turns[slot]:
-            await asyncio.sleep(EPISODE_S)
-        return (_renumbered(self._whole.frames, plan), _renumbered(self._whole.summary, plan)), ""
-
-
-def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Buffer:
+def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
     column = table.schema.get_field_index("episode_id")
     field = table.schema.field(column)
-    return ipc.pack(table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type)))
-
-
-class _Slot(Remote):
-    def __init__(self, actor: Any, number: int) -> None:
-        super().__init__(actor)
-        self.number = number
+    return table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type))
 
 
 class SlotsTransport(RayTransport):
@@ -85,17 +77,12 @@ class SlotsTransport(RayTransport):
     def __init__(self, job: Job, slots_n: int) -> None:
         super().__init__(_no_worker, job.config.rollout, CPUS_PER_PROCESS)
         plain: Any = SlotsActor
-        made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=4 * slots_n)
+        made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
 
     def start(self, slot: int, incarnation: int) -> Remote:
-        remote = _Slot(self._actors[slot % PROCESSES_N], slot)
-        self._asked[remote.actor.open.remote(slot)] = remote, "open"
-        return remote
-
-    def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        assert isinstance(handle, _Slot)
-        self._asked[handle.actor.run.remote(handle.number, plan)] = handle, plan
+        address, actor = self._hub.open(), self._actors[slot % PROCESSES_N]
+        return self._started(Remote(actor, address.number), actor.work.remote(address))
 
 
 def _no_worker(_: object) -> Any:
@@ -160,7 +147,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         for episode in pool.arrivals():
             begin_s, busy_s = time.monotonic(), time.thread_time()
             with clock.of("committer"):
-                spool.append(Episode(episode.frames, episode.summary))
+                spool.append(episode)
             wait_s += time.monotonic() - begin_s - (time.thread_time() - busy_s)
             if tally.add(steps_of(episode)):
                 break
@@ -171,6 +158,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         spent_s = clock.spent_s()
     for actor in transport._actors:
         ray.kill(actor)
+    transport.close()
     episodes_n = len(tally.done) - 1
     took_s = tally.done[-1][0] - tally.done[0][0]
     own_s = spent_s["supervisor"] + spent_s["committer"]

@@ -1,8 +1,8 @@
 """Workers as Ray actors that pull their weights, and the holder of these weights.
 
-A worker asks the holder for a policy when a plan names another than it has. Tables travel through the object store and
-are read in place. What Ray cannot do for a process that hangs - show its stacks, end it although it is stopped - is
-done from outside: on this node by the transport itself, on another by a caretaker there.
+A worker asks the holder for a policy when a plan names another than it has. Plans and episodes go past Ray (`channel`).
+What Ray cannot do for a process that hangs - show its stacks, end it although it is stopped - is done from outside: on
+this node by the transport itself, on another by a caretaker there.
 """
 
 from __future__ import annotations
@@ -11,7 +11,7 @@ import logging
 import os
 import time
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +20,8 @@ import ray
 from ray._private import worker as ray_worker
 from ray._private.state import actors
 
-from t6gps.service import cluster, processes
+from t6gps.service import channel, cluster, control, processes
+from t6gps.service.channel import Address, Hub
 from t6gps.service.cluster import start_actor
 from t6gps.service.processes import Process
 from t6gps.service.sampler import Failure, Runner, attempt, policy_digest, settings_digest
@@ -31,7 +32,6 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.settings import RolloutSettings
 
 MakeWorker = Callable[[RolloutSettings], Runner]
-Answer = tuple[tuple[pa.Buffer, pa.Buffer] | Failure | None, str]
 PULL_DEADLINE_S = 10.0
 EXAMINE_DEADLINE_S = 0.6
 """A caretaker that has not answered by then is cut off, and its node with it."""
@@ -62,46 +62,72 @@ class HolderActor:
         return max(self._held, default=-1)
 
 
+@dataclass(frozen=True)
+class Greeting:
+    """A worker's first message: who it is, its process, and the node in Ray's words."""
+
+    identity: Identity
+    process: Process | None
+    node: str
+
+
+@dataclass(frozen=True)
+class Answer:
+    """What became of a plan: an episode, in the memory beside this, a failure, or nothing for want of the policy."""
+
+    plan: EpisodePlan
+    failure: Failure | None = None
+    policy_digest: str = ""
+
+
 class WorkerActor:
     """A worker in a process of its own, which pulls the policy that its plan names."""
 
     def __init__(self) -> None:
         self._process = processes.dump_stacks_on_signal()
-        self._worker: Runner | None = None
         self._holder: Any = None
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
-    def open(self, make_worker: MakeWorker, settings: RolloutSettings, holder: Any) -> tuple[Identity, Process, str]:
-        """Make the worker; who it is, its process, and the node in Ray's words."""
-        self._worker, self._holder = make_worker(settings), holder
-        address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
-        identity = Identity(os.getpid(), address, settings_digest(settings.model_dump_json()))
-        return identity, self._process, cluster.this_node()
+    def work(self, make_worker: MakeWorker, settings: RolloutSettings, address: Address) -> None:
+        """Make a worker, and do what the supervisor says until its line is cut: EOFError or OSError.
 
-    def ping(self) -> None:
-        """A sign of life."""
+        It says a plan, or who holds the weights from now on, or nothing to get a sign of life.
+        """
+        worker = make_worker(settings)
+        with channel.connect(address) as line:
+            here: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
+            identity = Identity(os.getpid(), here, settings_digest(settings.model_dump_json()))
+            channel.send(line, Greeting(identity, self._process, cluster.this_node()))
+            while True:
+                asked, _ = channel.receive(line)
+                if isinstance(asked, EpisodePlan):
+                    channel.send(line, *self._run(worker, asked))
+                elif asked is None:
+                    channel.send(line, None)
+                else:
+                    self._holder = asked
 
-    def follow(self, holder: Any) -> None:
-        """Pull policies from another holder from now on."""
-        self._holder = holder
-
-    def run(self, plan: EpisodePlan) -> Answer:
-        """Frames and summary, a Failure, or None without the policy; and the policy's digest."""
-        if self._worker is None:
-            raise RunError("a worker must be opened before it runs plans")
-        if self._snapshot is None or self._snapshot.version != plan.policy_version:
-            try:
-                self._snapshot = ray.get(self._holder.version.remote(plan.policy_version), timeout=PULL_DEADLINE_S)
-            except ray.exceptions.RayError:
-                return None, ""  # the holder has died; its successor will be named
-            if self._snapshot is None:
-                return None, ""
-            self._digest = policy_digest(self._snapshot)
-        result = attempt(self._worker, plan, self._snapshot)
+    def _run(self, worker: Runner, plan: EpisodePlan) -> tuple[Answer, pa.Buffer]:
+        """An answer, and the memory beside it."""
+        snapshot = self._pulled(plan.policy_version)
+        if snapshot is None:
+            return Answer(plan), channel.NOTHING
+        result = attempt(worker, plan, snapshot)
         if isinstance(result, Failure):
-            return result, self._digest
-        return (ipc.pack(result.frames), ipc.pack(result.summary)), self._digest
+            return Answer(plan, result, self._digest), channel.NOTHING
+        return Answer(plan, None, self._digest), ipc.pack(result.frames, result.summary)
+
+    def _pulled(self, version: int) -> PolicySnapshot | None:
+        """The policy of that version; None when it cannot be had: another holder will be named then."""
+        if self._snapshot is None or self._snapshot.version != version:
+            try:
+                self._snapshot = ray.get(self._holder.version.remote(version), timeout=PULL_DEADLINE_S)
+            except ray.exceptions.RayError:
+                return None
+            if self._snapshot is not None:
+                self._digest = policy_digest(self._snapshot)
+        return self._snapshot
 
 
 class CaretakerActor:
@@ -142,10 +168,10 @@ def _how(error: Exception) -> str:
 
 
 class Remote:
-    """A worker as the transport knows it: its actor, and its process once it is ready."""
+    """A worker as the transport knows it: its actor, the number of its line, and its process once it is ready."""
 
-    def __init__(self, actor: Any) -> None:
-        self.actor = actor
+    def __init__(self, actor: Any, number: int) -> None:
+        self.actor, self.number = actor, number
         self.process: Process | None = None
         self.node = ""
         self.died = False
@@ -159,8 +185,10 @@ class RayTransport(Transport):
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
         self._node, self._logs = cluster.this_node(), _logs()
         self._caretakers: dict[str, Any] = {}
-        self._asked: dict[Any, tuple[Remote, EpisodePlan | str]] = {}
-        self._remotes: set[Remote] = set()
+        self._hub = Hub(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+        self._remotes: dict[int, Remote] = {}
+        self._at_work: dict[Any, Remote] = {}  # by the call in which it works, which ends with it
+        self._looked_s = 0.0
         self._held: dict[int, PolicySnapshot] = {}
         self._holder = start_actor(HolderActor, where=self._node)
         self._holder_pong: Any = None
@@ -186,53 +214,47 @@ class RayTransport(Transport):
             self._replace_holder()
 
     def start(self, slot: int, incarnation: int) -> Remote:
-        remote = Remote(start_actor(WorkerActor, cpus=self._cpus))
-        self._asked[remote.actor.open.remote(self._make_worker, self._settings, self._holder)] = remote, "open"
-        self._remotes.add(remote)
+        address = self._hub.open()
+        remote = Remote(start_actor(WorkerActor, cpus=self._cpus), address.number)
+        at_work = remote.actor.work.remote(self._make_worker, self._settings, address)
+        return self._started(remote, at_work)
+
+    def _started(self, remote: Remote, at_work: Any) -> Remote:
+        self._remotes[remote.number] = self._at_work[at_work] = remote
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        self._asked[handle.actor.run.remote(plan)] = handle, plan
+        self._hub.send(handle.number, plan)
 
     def ping(self, handle: Remote) -> None:
-        self._asked[handle.actor.ping.remote()] = handle, "ping"
+        self._hub.send(handle.number, None)
 
     def poll(self, wait_s: float) -> list[Report]:
-        self._watch_holder()
-        awaited = [*self._asked, *([] if self._holder_pong is None else [self._holder_pong])]
-        if not awaited:
-            time.sleep(wait_s)
-            return []
-        found, _ = ray.wait(awaited, num_returns=1, timeout=wait_s)
-        if found:
-            found, _ = ray.wait(awaited, num_returns=len(awaited), timeout=0)
-        if self._holder_pong in found:
-            found.remove(self._holder_pong)
-            self._hear_holder()
-        return [self._report(reference, *self._asked.pop(reference)) for reference in found]
+        heard = self._hub.hear(wait_s)
+        reports = [self._report(self._remotes[n], *message) for n, *message in heard if n in self._remotes]
+        if time.monotonic() - self._looked_s >= control.TICK_S:
+            reports += self._ends()
+            self._watch_holder()
+            self._looked_s = time.monotonic()
+        return reports
 
-    def _report(self, reference: Any, remote: Remote, asked: EpisodePlan | str) -> Report:
-        try:
-            answer = ray.get(reference)
-        except ray.exceptions.RayTaskError as error:
-            cause = error.cause if isinstance(error.cause, Exception) else error
-            return Died(remote, type(cause).__name__, str(cause))
-        except ray.exceptions.RayError as error:
-            how = _how(error)
-            memory = isinstance(error, ray.exceptions.OutOfMemoryError)
-            remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
-            return Died(remote, type(error).__name__, how)
-        if isinstance(asked, EpisodePlan):
-            result, digest = answer
-            if isinstance(result, tuple):
-                result = Episode(*map(ipc.unpack, result))
-            return Done(remote, asked, result, digest)
-        if asked == "ping":
+    def _report(self, remote: Remote, said: Greeting | Answer | None, packed: pa.Buffer) -> Report:
+        if said is None:
             return Alive(remote)
-        identity, remote.process, remote.node = answer
+        if isinstance(said, Answer):
+            return Done(remote, said.plan, said.failure or _episode(packed), said.policy_digest)
+        remote.process, remote.node = said.process, said.node
+        self._hub.send(remote.number, self._holder)
         if remote.node != self._node and remote.node not in self._caretakers:
             self._caretakers[remote.node] = start_actor(CaretakerActor, where=remote.node)
-        return Ready(remote, identity)
+        return Ready(remote, said.identity)
+
+    def _ends(self) -> list[Report]:
+        """Of the workers that have ended, and with them the call in which they work."""
+        if not self._at_work:
+            return []
+        over, _ = ray.wait(list(self._at_work), num_returns=len(self._at_work), timeout=0)
+        return [_end(self._at_work.pop(call), call) for call in over]
 
     def examine(self, handle: Remote) -> Remains:
         if handle.process is None:
@@ -261,8 +283,12 @@ class RayTransport(Transport):
             processes.kill(handle.process)  # a stopped process does not hear Ray
         elif handle.node in self._caretakers:
             self._caretakers[handle.node].kill.remote(handle.process)
-        self._asked = {key: value for key, value in self._asked.items() if value[0] is not handle}
-        self._remotes.discard(handle)
+        self._hub.cut(handle.number)
+        del self._remotes[handle.number]
+        self._at_work = {call: remote for call, remote in self._at_work.items() if remote is not handle}
+
+    def close(self) -> None:
+        self._hub.close()
 
     def placed(self, handle: Remote) -> bool:
         known = actors(handle.actor._actor_id.hex())
@@ -272,18 +298,17 @@ class RayTransport(Transport):
         return cluster.free_workers(self._cpus)
 
     def _watch_holder(self) -> None:
-        now = time.monotonic()
+        silent_s = time.monotonic() - self._holder_pinged_s
         if self._holder_pong is None:
-            if now - self._holder_pinged_s >= HOLDER_PING_S:
-                self._holder_pong, self._holder_pinged_s = self._holder.ping.remote(), now
-        elif now - self._holder_pinged_s > HOLDER_START_S:
-            self._replace_holder()
-
-    def _hear_holder(self) -> None:
-        try:
-            ray.get(self._holder_pong)
-            self._holder_pong = None
-        except ray.exceptions.RayError:
+            if silent_s >= HOLDER_PING_S:
+                self._holder_pong, self._holder_pinged_s = self._holder.ping.remote(), time.monotonic()
+        elif ray.wait([self._holder_pong], timeout=0)[0]:
+            try:
+                ray.get(self._holder_pong)
+                self._holder_pong = None
+            except ray.exceptions.RayError:
+                self._replace_holder()
+        elif silent_s > HOLDER_START_S:
             self._replace_holder()
 
     def _replace_holder(self) -> None:
@@ -292,7 +317,31 @@ class RayTransport(Transport):
         self._holder = start_actor(HolderActor, where=self._node)
         for version in sorted(self._held):
             self._holder.publish.remote(self._held[version])
-        for remote in self._remotes:
-            remote.actor.follow.remote(self._holder)
+        for remote in self._remotes.values():
+            if remote.node:  # the others have no line yet, and are told when they have
+                self._hub.send(remote.number, self._holder)
         self._holder_pong, self._holder_pinged_s = None, time.monotonic()
         self.holders_n += 1
+
+
+def _episode(packed: pa.Buffer) -> Episode | None:
+    """What lies in the memory beside an answer."""
+    if not packed.size:
+        return None
+    frames, summary = ipc.unpack(packed, 2)
+    return Episode(frames, summary, packed)
+
+
+def _end(remote: Remote, call: Any) -> Died:
+    """How a worker ended: as Ray tells, or by the error that it ended with."""
+    try:
+        ray.get(call)
+    except ray.exceptions.RayTaskError as error:
+        cause = error.cause if isinstance(error.cause, Exception) else error
+        return Died(remote, type(cause).__name__, str(cause))
+    except ray.exceptions.RayError as error:
+        how = _how(error)
+        memory = isinstance(error, ray.exceptions.OutOfMemoryError)
+        remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
+        return Died(remote, type(error).__name__, how)
+    raise AssertionError("a worker's call ends by an error")

@@ -51,7 +51,16 @@ class EpisodePlan:
 
 @dataclass(frozen=True)
 class Episode:
-    """One recorded episode: `frames` with T + 1 rows and `summary` with one row (schemas in `schema`)."""
+    """One recorded episode: `frames` with T + 1 rows and `summary` with one row (schemas in `schema`).
+
+    packed    both tables as one piece of memory (`ipc.pack`), where they lie in one
+    """
 
     frames: pa.Table
     summary: pa.Table
+    packed: pa.Buffer | None = None
+
+    @property
+    def nbytes(self) -> int:
+        """Memory that it takes."""
+        return int(self.frames.nbytes if self.packed is None else self.packed.size)

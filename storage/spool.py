@@ -46,9 +46,7 @@ def checked(episode: Episode, iteration: int) -> Episode:
 
 def read(path: Path) -> Episode:
     """The episode in a file of a spool; its tables lie in the file. ArrowException or OSError when it is torn."""
-    source = pa.memory_map(str(path))
-    frames, summary = (ipc.unpack(source) for _ in range(2))
-    return Episode(frames, summary)
+    return Episode(*ipc.unpack(pa.memory_map(str(path)), 2))
 
 
 class Spool:
@@ -72,9 +70,8 @@ class Spool:
     def append(self, episode: Episode) -> None:
         """Keep a `checked` episode; once this returns, it survives a crash. The same one again replaces its file."""
         path = self.path(episode.summary.column("episode_id")[0].as_py())
-        with durable.hidden(path).open("wb") as file:
-            for table in (episode.frames, episode.summary):
-                file.write(ipc.pack(table))
+        packed = episode.packed
+        durable.hidden(path).write_bytes(ipc.pack(episode.frames, episode.summary) if packed is None else packed)
         durable.publish(path)
 
     def episodes(self) -> dict[int, Episode]:

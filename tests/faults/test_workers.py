@@ -249,7 +249,7 @@ def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(ho
         most = max(most, len(ledger.leases) + ledger.arrived)
         bytes_ = max(bytes_, int(pool.status(time.monotonic())["bytes_in_flight"]))
     assert most == 4
-    assert bytes_ == 4 * found[0].frames.nbytes
+    assert bytes_ == 4 * found[0].nbytes
     house.check(found + list(episodes))
 
 
