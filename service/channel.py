@@ -12,9 +12,11 @@ import pickle
 import secrets
 import socket
 import struct
+from collections.abc import Generator
 from contextlib import suppress
 from dataclasses import dataclass, field
 from queue import Empty, SimpleQueue
+from selectors import EVENT_READ, DefaultSelector
 from threading import Lock, Thread
 from typing import Any
 
@@ -24,7 +26,6 @@ LENGTHS = struct.Struct("<QQ")
 """Of the head and of the memory that follows it."""
 INTRODUCTION = struct.Struct("<32sQ")
 """Secret and number."""
-INTRODUCE_DEADLINE_S = 10.0
 NOTHING = pa.py_buffer(b"")
 """The memory of a message that has none."""
 _log = logging.getLogger(__name__)
@@ -39,21 +40,31 @@ class Address:
     number: int
     secret: bytes = field(repr=False)
 
+    @property
+    def introduction(self) -> bytes:
+        """The first that a worker sends."""
+        return INTRODUCTION.pack(self.secret, self.number)
+
 
 def connect(address: Address) -> socket.socket:
     """The worker's end of its line. OSError when nobody listens there."""
     line = socket.create_connection((address.host, address.port))
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
-    line.sendall(INTRODUCTION.pack(address.secret, address.number))
+    line.sendall(address.introduction)
     return line
 
 
 def send(line: socket.socket, head: Any, memory: pa.Buffer = NOTHING) -> None:
     """Send a message. OSError when the line is cut."""
-    pickled = pickle.dumps(head)
-    line.sendall(LENGTHS.pack(len(pickled), memory.size) + pickled)
+    line.sendall(headed(head, memory))
     if memory.size:
         line.sendall(memory)
+
+
+def headed(head: Any, memory: pa.Buffer) -> bytes:
+    """What goes before the memory: both lengths, and the head."""
+    pickled = pickle.dumps(head)
+    return LENGTHS.pack(len(pickled), memory.size) + pickled
 
 
 def receive(line: socket.socket) -> tuple[Any, pa.Buffer]:
@@ -74,8 +85,29 @@ def _exactly(line: socket.socket, n: int) -> pa.Buffer:
     return buffer
 
 
+class Incoming:
+    """The bytes of a line, cut into the pieces that its reader wants: a generator that yields their lengths."""
+
+    def __init__(self, line: socket.socket, reader: Generator[int, pa.Buffer, None]) -> None:
+        self._line, self._reader = line, reader
+        self._want(next(reader))
+
+    def _want(self, n: int) -> None:
+        self._piece = pa.allocate_buffer(n)
+        self._rest = memoryview(self._piece).cast("B")
+
+    def advance(self) -> None:
+        """Take what has come. EOFError or OSError when the line is cut, StopIteration when its reader is done."""
+        received_n = self._line.recv_into(self._rest)
+        if not received_n:
+            raise EOFError("the line is cut")
+        self._rest = self._rest[received_n:]
+        if not self._rest:
+            self._want(self._reader.send(self._piece))
+
+
 class Hub:
-    """The supervisor's ends of all lines. A thread reads each, so that nobody waits for a line that stalls."""
+    """The supervisor's ends of all lines. One thread reads them, so that nobody waits for a line that stalls."""
 
     def __init__(self, host: str) -> None:
         family = socket.AF_INET6 if ":" in host else socket.AF_INET
@@ -83,8 +115,8 @@ class Hub:
         self._host, self._secret = host, secrets.token_bytes(32)
         self._lines: dict[int, socket.socket | None] = {}
         self._heard: SimpleQueue[tuple[int, Any, pa.Buffer]] = SimpleQueue()
-        self._opened_n, self._lock = 0, Lock()
-        Thread(target=self._welcome, name="t6gps-hub", daemon=True).start()
+        self._opened_n, self._closed, self._lock = 0, False, Lock()
+        Thread(target=self._read, name="t6gps-hub", daemon=True).start()
 
     def open(self) -> Address:
         """Expect one more worker; where it shall connect."""
@@ -119,38 +151,42 @@ class Hub:
         """End every line, and expect nobody."""
         for number in list(self._lines):
             self.cut(number)
+        self._closed = True
         _shut(self._server)
 
-    def _welcome(self) -> None:
-        while True:
-            try:
-                line, _ = self._server.accept()
-            except OSError:  # it was shut
-                self._server.close()
-                return
-            Thread(target=self._read, args=(line,), name="t6gps-line", daemon=True).start()
+    def _read(self) -> None:
+        """What the thread does until the server is shut."""
+        with DefaultSelector() as selector:
+            selector.register(self._server, EVENT_READ)
+            while not self._closed:
+                for key, _ in selector.select():
+                    try:
+                        if key.data is not None:
+                            key.data.advance()
+                        elif not self._closed:
+                            line, _ = self._server.accept()
+                            line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+                            selector.register(line, EVENT_READ, Incoming(line, self._messages(line)))
+                    except Exception as error:  # whatever is wrong with a line, the others are read
+                        _log.info("a line to a worker has ended: %r", error)
+                        if key.data is not None:
+                            selector.unregister(key.fileobj)
+                            key.fileobj.close()  # type: ignore[union-attr]
+            for key in selector.get_map().values():
+                key.fileobj.close()  # type: ignore[union-attr]
 
-    def _read(self, line: socket.socket) -> None:
-        with line:
-            try:
-                number = self._introduced(line)
-                while number is not None:
-                    self._heard.put((number, *receive(line)))
-            except (OSError, EOFError) as error:
-                _log.info("a line to a worker has ended: %s", error)
-
-    def _introduced(self, line: socket.socket) -> int | None:
-        """The number of the worker that has connected; None for a stranger."""
-        line.settimeout(INTRODUCE_DEADLINE_S)
-        secret, number = INTRODUCTION.unpack(_exactly(line, INTRODUCTION.size))
-        line.settimeout(None)
-        line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+    def _messages(self, line: socket.socket) -> Generator[int, pa.Buffer, None]:
+        """The reader of a line."""
+        secret, number = INTRODUCTION.unpack((yield INTRODUCTION.size))
         with self._lock:
-            if hmac.compare_digest(secret, self._secret) and self._lines.get(number, line) is None:
-                self._lines[number] = line
-                return int(number)
-        _log.warning("somebody unknown tried to connect as a worker, from %s", line.getpeername())
-        return None
+            if not hmac.compare_digest(secret, self._secret) or self._lines.get(number, line) is not None:
+                _log.warning("somebody unknown tried to connect as a worker, from %s", line.getpeername())
+                return
+            self._lines[number] = line
+        while True:
+            head_n, memory_n = LENGTHS.unpack((yield LENGTHS.size))
+            head = pickle.loads((yield head_n))
+            self._heard.put((number, head, (yield memory_n) if memory_n else NOTHING))
 
 
 def _shut(end: socket.socket) -> None:

@@ -7,11 +7,14 @@ with an interpreter each would need some 80 GB.
 
 from __future__ import annotations
 
+import asyncio
 import os
+import pickle
 import socket
 import tempfile
 import time
 from collections.abc import Callable
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -20,7 +23,7 @@ import pyarrow as pa
 import ray
 
 from t6gps.service import channel, seeding
-from t6gps.service.channel import Address
+from t6gps.service.channel import LENGTHS, Address
 from t6gps.service.cluster import join_or_start, this_node
 from t6gps.service.config import Config
 from t6gps.service.control import Control
@@ -45,24 +48,29 @@ NOTE = (
 
 
 class SlotsActor:
-    """Many workers in one process: each is a thread that sleeps."""
+    """Many workers in one process, each a call that sleeps."""
 
     def __init__(self, job: Job) -> None:
         self._whole = stub.episode(job.plans[0], job.snapshot)
         self._greeting = Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
 
-    def work(self, address: Address) -> None:
+    async def work(self, address: Address) -> None:
         """As WorkerActor.work: sleep for each plan, then send the same numbers under its number."""
-        with channel.connect(address) as line:
-            channel.send(line, self._greeting)
+        reader, writer = await asyncio.open_connection(address.host, address.port)
+        writer.write(address.introduction + channel.headed(self._greeting, channel.NOTHING))
+        with suppress(EOFError, OSError):  # until the line is cut
             while True:
-                asked, _ = channel.receive(line)
-                if isinstance(asked, EpisodePlan):
-                    time.sleep(EPISODE_S)
-                    tables = (_renumbered(table, asked) for table in (self._whole.frames, self._whole.summary))
-                    channel.send(line, Answer(asked), ipc.pack(*tables))
-                elif asked is None:
-                    channel.send(line, None)
+                head_n, _ = LENGTHS.unpack(await reader.readexactly(LENGTHS.size))
+                plan = pickle.loads(await reader.readexactly(head_n))
+                if plan is None:
+                    writer.write(channel.headed(None, channel.NOTHING))
+                elif isinstance(plan, EpisodePlan):  # nothing is pulled here
+                    await asyncio.sleep(EPISODE_S)
+                    packed = ipc.pack(
+                        *(_renumbered(table, plan) for table in (self._whole.frames, self._whole.summary))
+                    )
+                    writer.writelines((channel.headed(Answer(plan), packed), packed))
+                    await writer.drain()
 
 
 def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:

@@ -89,24 +89,27 @@ class WorkerActor:
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
-    def work(self, make_worker: MakeWorker, settings: RolloutSettings, address: Address) -> None:
-        """Make a worker, and do what the supervisor says until its line is cut: EOFError or OSError.
+    def work(self, make_worker: MakeWorker, settings: RolloutSettings, address: Address) -> str:
+        """Make a worker, and do what the supervisor says until their line is cut; how it was.
 
-        It says a plan, or who holds the weights from now on, or nothing to get a sign of life.
+        The supervisor says a plan, or who holds the weights from now on, or nothing to get a sign of life.
         """
         worker = make_worker(settings)
-        with channel.connect(address) as line:
-            here: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
-            identity = Identity(os.getpid(), here, settings_digest(settings.model_dump_json()))
-            channel.send(line, Greeting(identity, self._process, cluster.this_node()))
-            while True:
-                asked, _ = channel.receive(line)
-                if isinstance(asked, EpisodePlan):
-                    channel.send(line, *self._run(worker, asked))
-                elif asked is None:
-                    channel.send(line, None)
-                else:
-                    self._holder = asked
+        here: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
+        identity = Identity(os.getpid(), here, settings_digest(settings.model_dump_json()))
+        try:
+            with channel.connect(address) as line:
+                channel.send(line, Greeting(identity, self._process, cluster.this_node()))
+                while True:
+                    asked, _ = channel.receive(line)
+                    if isinstance(asked, EpisodePlan):
+                        channel.send(line, *self._run(worker, asked))
+                    elif asked is None:
+                        channel.send(line, None)
+                    else:
+                        self._holder = asked
+        except (EOFError, OSError) as error:
+            return f"{type(error).__name__}: {error}"
 
     def _run(self, worker: Runner, plan: EpisodePlan) -> tuple[Answer, pa.Buffer]:
         """An answer, and the memory beside it."""
@@ -335,7 +338,7 @@ def _episode(packed: pa.Buffer) -> Episode | None:
 def _end(remote: Remote, call: Any) -> Died:
     """How a worker ended: as Ray tells, or by the error that it ended with."""
     try:
-        ray.get(call)
+        return Died(remote, "cut off", ray.get(call))
     except ray.exceptions.RayTaskError as error:
         cause = error.cause if isinstance(error.cause, Exception) else error
         return Died(remote, type(cause).__name__, str(cause))
@@ -344,4 +347,3 @@ def _end(remote: Remote, call: Any) -> Died:
         memory = isinstance(error, ray.exceptions.OutOfMemoryError)
         remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
         return Died(remote, type(error).__name__, how)
-    raise AssertionError("a worker's call ends by an error")
