@@ -179,6 +179,7 @@ class Remote:
         self.node = ""
         self.died = False
         self.exited = False  # it died by leaving, as Ray has seen, or for want of memory
+        self.cut_off = False  # its line broke
 
 
 class RayTransport(Transport):
@@ -266,7 +267,7 @@ class RayTransport(Transport):
             remains = _remains(handle.process, self._logs, handle.died)
         else:
             remains = self._examine_there(handle.process, handle.node, handle.died)
-        return replace(remains, blameless=remains.blameless and not handle.exited)
+        return replace(remains, blameless=(remains.blameless or handle.cut_off) and not handle.exited)
 
     def _examine_there(self, process: Process, node: str, died: bool) -> Remains:
         if node in self._caretakers:
@@ -338,7 +339,9 @@ def _episode(packed: pa.Buffer) -> Episode | None:
 def _end(remote: Remote, call: Any) -> Died:
     """How a worker ended: as Ray tells, or by the error that it ended with."""
     try:
-        return Died(remote, "cut off", ray.get(call))
+        how = ray.get(call)
+        remote.cut_off = True
+        return Died(remote, "CutOff", how)
     except ray.exceptions.RayTaskError as error:
         cause = error.cause if isinstance(error.cause, Exception) else error
         return Died(remote, type(cause).__name__, str(cause))

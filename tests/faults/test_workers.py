@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import os
 import signal
+import socket
 import threading
 import time
 from collections.abc import Callable, Iterator
@@ -105,6 +106,23 @@ def test_an_episode_whose_workers_are_killed_from_outside_is_innocent(house: Hou
         house.check(list(house.sample()))
     kinds = [failure.kind for failure in house.executor.ledger.failures[number]]
     assert kinds == ["lost"] * (FAILURES_ALLOWED_N + 1)
+
+
+def test_a_worker_whose_line_breaks_is_replaced_and_its_episode_is_innocent(house: House) -> None:
+    number, cut = house.order(5, "slow 1"), list[int]()
+
+    def cut_off(_: float) -> None:
+        for worker in at_work_on(house, number):
+            if not cut:
+                cut.append(worker.handle.number)
+                line = house.executor._transport._hub._lines[worker.handle.number]
+                assert line is not None
+                line.shutdown(socket.SHUT_RDWR)
+
+    with after_every_tick(house, cut_off):
+        house.check(list(house.sample()))
+    (failure,) = house.executor.ledger.failures[number]
+    assert (failure.kind, failure.error) == ("lost", "CutOff")
 
 
 @pytest.mark.parametrize("how", ["SIGSTOP", "hang-in-c", "hang-in-python"])
