@@ -337,7 +337,7 @@ def _episode(packed: pa.Buffer) -> Episode | None:
 
 
 def _end(remote: Remote, call: Any) -> Died:
-    """How a worker ended: as Ray tells, or by the error that it ended with."""
+    """How a worker ended: its line broke, it raised an error, or its process died as Ray tells."""
     try:
         how = ray.get(call)
         remote.cut_off = True
