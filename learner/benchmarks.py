@@ -169,8 +169,9 @@ def _backward_pass_against_loop(
 ) -> dict[str, float]:
     fits = [surrogate.fit_class(job) for job in jobs]
     patch = surrogate.patch(jobs, fits, len(rows.acts))
-    gradient = cost.gradient(rows.state, rows.target, TARGET_SPEED_M_PER_S, VERTICAL_WEIGHT).astype(np.float64)
-    hessian = cost.hessian(rows.state.shape[1], VERTICAL_WEIGHT).astype(np.float64)
+    residual = cost.residual(rows.state, rows.target, TARGET_SPEED_M_PER_S, VERTICAL_WEIGHT).astype(np.float64)
+    root = cost.root(rows.state.shape[1], VERTICAL_WEIGHT).astype(np.float64)
+    gradient, hessian = residual @ root, root.T @ root
     deviation = (rows.action - rows.action_mean).astype(np.float64)
     variance = float(np.nanmean(np.square(deviation)))
     length = settings.horizon_steps
@@ -185,7 +186,7 @@ def _backward_pass_against_loop(
     models, error, largest = lqg.prepare(patch.models, settings.kl_weight, variance), 0.0, 0.0
     for first in range(0, len(starts), CHUNK):
         steps = starts[first : first + CHUNK, None] + np.arange(length)
-        found = lqg.backward_pass(models, patch.of_row[steps], gradient[steps + 1], hessian, deviation[steps])
+        found = lqg.backward_pass(models, patch.of_row[steps], residual[steps + 1], root, deviation[steps])
         for number, (K, k, _) in enumerate(looped[first : first + CHUNK]):
             error = max(error, np.abs(found.K[number] - K).max(), np.abs(found.k[number] - k).max())
             largest = max(largest, np.abs(K).max(), np.abs(k).max())
@@ -201,7 +202,10 @@ def _backward_pass_against_loop(
 def plain_backward_pass(
     F: Array, P: Array, variance: float, kl_weight: float, gradient: Array, hessian: Array, deviation: Array
 ) -> tuple[Any, Any, float]:
-    """K [T, nu, nx], k [T, nu] and the predicted change of the cost of one sub-trajectory, as lqg states them."""
+    """K [T, nu, nx], k [T, nu] and the predicted change of the cost of one sub-trajectory, by the Riccati recursion.
+
+    gradient [T, nx] and hessian [nx, nx] are those of the running cost; the rest is as in `lqg`.
+    """
     length, nx, nu = len(F), F.shape[1], deviation.shape[1]
     K, k = np.zeros((length, nu, nx)), np.zeros((length, nu))
     precision = np.diag(np.full(nu, kl_weight / max(variance, lqg.ACTION_VARIANCE_FLOOR_M2)))

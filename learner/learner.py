@@ -174,8 +174,8 @@ class Learner:
         rows, patch = _of(self._segmented, "segment").rows, _of(self._fitted, "fit").patch
         settings = self._settings
         weights = self._target_speed_m_per_s, self._vertical_weight
-        gradient = cost.gradient(rows.state, rows.target, *weights)
-        hessian = cost.hessian(rows.state.shape[1], self._vertical_weight)
+        residual = cost.residual(rows.state, rows.target, *weights)
+        root = cost.root(rows.state.shape[1], self._vertical_weight)
         deviation, variance = self._deviation(rows, patch)
         models = lqg.prepare(patch.models, settings.kl_weight, variance)
         improved, predicted = np.full_like(rows.action, np.nan), np.full(len(rows.acts), np.nan, dtype=np.float32)
@@ -195,7 +195,7 @@ class Learner:
             climbed = np.clip(leading.improved(self.snapshot), *self._command_range_m)
 
         def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
-            given = models, patch.of_row[steps], gradient[steps + 1], hessian
+            given = models, patch.of_row[steps], residual[steps + 1], root
             if climbed is not None:
                 k = climbed[steps] - rows.action[steps]
                 return k, lqg.predicted_change(*given, k)

@@ -6,16 +6,23 @@ Everything is expressed in deviations around the recorded states x and actions u
     F          slopes of the surrogate dynamics      dx[t+1] = F[t] [dx[t]; du[t]],  F = [Fx Fu]
     P, S       surrogate policy                      slopes and (diagonal) covariance
     dev        recorded action minus policy mean     [T, nu]
-    H, h[t]    Hessian and gradient of the running cost of the state after step t
-    c          weight of the KL term, for equal covariances 1/2 e' S^-1 e with e = dev + du - P dx
-    V, v       Hessian and gradient of the cost-to-go of the state after the step, with its own running cost
+    D, r[t]    running cost of the state after step t, |r[t] + D dx[t+1]|^2 / 2
+    c          weight of the KL term, for equal covariances 1/2 e' R e with e = dev + du - P dx, R = c S^-1
 
-    Quu = Fu' V Fu + c S^-1        Qux = Fu' V Fx - c S^-1 P        qu = Fu' v + c S^-1 dev
-    Qxx = Fx' V Fx + c P' S^-1 P                                    qx = Fx' v - c P' S^-1 dev
-    K = -Quu^-1 Qux,   k = -Quu^-1 qu,   V <- Qxx + Qxu K + H,   v <- qx + Qxu k + h
+The cost-to-go is a sum of squares as well, |l + L dx|^2 / 2, and in terms of e, with du = e + P dx - dev, a step is a
+least squares problem in e. Going back from L = D, l = r[T-1]:
 
-The improved policy is u* = u + k + K dx; at the recorded states u* = u + k. Actions cost nothing by
-themselves: Quu is definite through the KL term alone, so S needs the floor below.
+    Gu = L Fu    Gx = L (Fx + Fu P)    g = l - Gu dev      the cost-to-go as a function of dx and e
+    M = I + Gu R^-1 Gu' = U'U
+    K = P - R^-1 Gu' M^-1 Gx           k = -dev - R^-1 Gu' M^-1 g
+    L <- [U^-T Gx; D]                  l <- [U^-T g; r[t-1]]
+
+These are the gains of the Riccati recursion with V = L'L, by the matrix inversion lemma (Quu = Gu'Gu + R). M is as
+large as L has rows, three more at each step back; longer L than nx are brought to a triangle by Householder
+reflections. Nothing is subtracted, and M is definite whatever the models are.
+
+The improved policy is u* = u + k + K dx; at the recorded states u* = u + k. Actions cost nothing by themselves, so S
+needs the floor below.
 """
 
 from __future__ import annotations
@@ -34,6 +41,8 @@ Ints = NDArray[np.int64]
 
 ACTION_VARIANCE_FLOOR_M2 = 1e-4
 """No policy counts as more certain than 1 cm per cable."""
+COLUMNS = 16
+"""Rows of F are a multiple of it (learner/native/backward.c)."""
 
 
 @dataclass(frozen=True)
@@ -51,38 +60,43 @@ class Improvement:
 
 @dataclass(frozen=True)
 class LqgModels:
-    """What the backward pass needs of each of k models: F and the KL terms c S^-1, c S^-1 P and c P' S^-1 P."""
+    """What the backward pass needs of each of k models.
+
+    F           slopes [Fx + Fu P, 0, Fu] with respect to dx, to the constant 1 (none) and to e, columns of zeros after
+                them [k, nx, a multiple of 16]
+    R_inverse   S / c [k, nu];   P [k, nu, nx]
+    """
 
     F: NDArray[np.float32]
-    precision: NDArray[np.float32]
-    precision_P: NDArray[np.float32]
-    P_precision_P: NDArray[np.float32]
+    R_inverse: NDArray[np.float32]
+    P: NDArray[np.float32]
 
 
 def prepare(models: Models, kl_weight: float, variance_m2: float | None = None) -> LqgModels:
     """Model table of the backward pass, in its single precision; `variance_m2` replaces the fitted S when given."""
     fitted = models.variance if variance_m2 is None else np.full_like(models.variance, variance_m2)
-    precision = kl_weight / np.maximum(fitted, ACTION_VARIANCE_FLOOR_M2)
-    precision_P = precision[:, :, None] * models.P
-    both = np.swapaxes(models.P, 1, 2) @ precision_P
-    return LqgModels(*map(_single, (models.F, precision, precision_P, both)))
+    count, nu, nx = models.P.shape
+    Fx, Fu = models.F[:, :, :nx], models.F[:, :, nx:]
+    F = np.zeros((count, nx, -(-(nx + 1 + nu) // COLUMNS) * COLUMNS), dtype=np.float32)
+    F[:, :, :nx] = Fx + Fu @ models.P
+    F[:, :, nx + 1 : nx + 1 + nu] = Fu
+    return LqgModels(F, _single(np.maximum(fitted, ACTION_VARIANCE_FLOOR_M2) / kl_weight), _single(models.P))
 
 
 def _single(array: Array) -> NDArray[np.float32]:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
-def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Array, deviation: Array) -> Improvement:
+def backward_pass(models: LqgModels, model: Ints, residual: Array, root: Array, deviation: Array) -> Improvement:
     """Improved local policies along sub-trajectories of one length (learner/native/backward.c).
 
     model      model of each step in the table [b, T]
-    gradient   h of the state after each step [b, T, nx];   hessian   H [nx, nx]
+    residual   r of the state after each step [b, T, m];   root   D [m, nx]
     deviation  dev [b, T, nu]
 
-    DataError if Quu is not positive definite somewhere, as with models that are not finite.
+    DataError where no gains exist, as with models that are not finite.
     """
-    count, length, nx = gradient.shape
-    nu = deviation.shape[2]
+    (count, length), (nu, nx) = model.shape, models.P.shape[1:]
     found = Improvement(
         np.empty((count, length, nu, nx), dtype=np.float32),
         np.empty((count, length, nu), dtype=np.float32),
@@ -90,12 +104,11 @@ def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Arra
     )
     failed = _backward.improve(
         models.F,
-        models.precision,
-        models.precision_P,
-        models.P_precision_P,
+        models.R_inverse,
+        models.P,
         np.ascontiguousarray(model, dtype=np.int64),
-        _single(gradient),
-        _single(hessian),
+        _single(residual),
+        _single(root),
         _single(deviation),
         found.K,
         found.k,
@@ -103,22 +116,24 @@ def backward_pass(models: LqgModels, model: Ints, gradient: Array, hessian: Arra
     )
     if failed >= 0:
         raise DataError(
-            f"the backward pass cannot improve sub-trajectory {failed} of {count}, whose Quu is not positive definite; "
-            "its models are not finite or too steep: use a larger learner.kl_weight or learner.prior_samples"
+            f"the backward pass cannot improve sub-trajectory {failed} of {count}: its models are not finite or too "
+            "steep for single precision; use a larger learner.prior_samples or learner.kl_weight"
         )
     return found
 
 
-def predicted_change(models: LqgModels, model: Ints, gradient: Array, hessian: Array, change: Array) -> Array:
+def predicted_change(models: LqgModels, model: Ints, residual: Array, root: Array, change: Array) -> Array:
     """Change of the running cost after each step [b, T] (m2/s2) when actions change by `change` [b, T, nu].
 
     What the models promise of actions from elsewhere, as `Improvement` does of those of the backward pass.
     """
-    deviation, found = np.zeros_like(gradient[:, 0]), np.empty(model.shape, dtype=np.float32)
-    for step in range(model.shape[1]):
-        both = np.concatenate([deviation, change[:, step]], axis=1)
-        deviation = np.einsum("bij,bj->bi", models.F[model[:, step]], both)
-        found[:, step] = np.einsum("bi,bi->b", gradient[:, step] + deviation @ hessian / 2, deviation)
+    nu, nx = models.P.shape[1:]
+    dx, found = np.zeros((len(model), nx), dtype=np.float32), np.empty(model.shape, dtype=np.float32)
+    for step, chosen in enumerate(model.T):
+        F, e = models.F[chosen], change[:, step] - np.einsum("bij,bj->bi", models.P[chosen], dx)
+        dx = np.einsum("bij,bj->bi", F[:, :, :nx], dx) + np.einsum("bij,bj->bi", F[:, :, nx + 1 : nx + 1 + nu], e)
+        more = dx @ root.T
+        found[:, step] = np.einsum("bi,bi->b", more, residual[:, step] + more / 2)
     return found
 
 

@@ -17,7 +17,7 @@ def test_standing_still_costs_the_squared_target_speed() -> None:
     np.testing.assert_allclose(cost.running_cost(np.zeros((1, 3)), np.array([[0.6, 0.8]]), 0.8, 0.1), 0.64)
 
 
-def test_gradient_and_hessian_are_those_of_the_cost() -> None:
+def test_residual_and_root_give_gradient_and_hessian_of_the_cost() -> None:
     rng = np.random.default_rng(0)
     state, target = rng.normal(size=5), np.array([0.6, -0.8])
 
@@ -26,9 +26,10 @@ def test_gradient_and_hessian_are_those_of_the_cost() -> None:
 
     steps = 1e-4 * np.eye(5)
     numeric = [(at(state + e) - at(state - e)) / 2e-4 for e in steps]
-    np.testing.assert_allclose(cost.gradient(state, target, 0.8, 0.1), numeric, atol=1e-9)
+    root = cost.root(5, 0.1)
+    np.testing.assert_allclose(cost.residual(state, target, 0.8, 0.1) @ root, numeric, atol=1e-9)
     second = [
         [(at(state + a + b) - at(state + a - b) - at(state - a + b) + at(state - a - b)) / 4e-8 for a in steps]
         for b in steps
     ]
-    np.testing.assert_allclose(cost.hessian(5, 0.1), second, atol=1e-6)
+    np.testing.assert_allclose(root.T @ root, second, atol=1e-6)
