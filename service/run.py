@@ -27,7 +27,7 @@ from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.storage.spool import Spool
+from t6gps.storage.spool import Spool, read
 
 PHASE_TITLES = {
     "sample": "sampling",
@@ -90,21 +90,21 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
 
 @dataclass(frozen=True)
 class Batch:
-    """The episodes of one iteration: planned, those in the spool by number, and the policy that acts in the others."""
+    """The episodes of one iteration: planned, the numbers of those in the spool, and who acts in the others."""
 
     plans: list[EpisodePlan]
-    episodes: dict[int, Episode]
+    kept: set[int]
     snapshot: PolicySnapshot
 
     @property
     def missing(self) -> list[EpisodePlan]:
-        return [plan for plan in self.plans if plan.episode_id not in self.episodes]
+        return [plan for plan in self.plans if plan.episode_id not in self.kept]
 
 
 def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
     plans = seeding.training_plans(config, spool.iteration)
     snapshot = executor.ask("policy", plans[0].policy_version)
-    return Batch(plans, spool.episodes(), snapshot)
+    return Batch(plans, set(spool.episodes()), snapshot)
 
 
 def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
@@ -112,15 +112,16 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
     with _timed(durations, "sample"):
         spool = Spool(run.spool, iteration)
         batch = _batch(config, executor, spool)
-        plans, episodes = batch.plans, batch.episodes
+        plans, kept = batch.plans, batch.kept
         arriving = executor.sample(batch.missing, batch.snapshot)
-        observer.progress(iteration, "sample", len(episodes), len(plans))
+        observer.progress(iteration, "sample", len(kept), len(plans))
         for episode in arriving:
             spool.append(episode)
-            episodes[episode.summary["episode_id"][0].as_py()] = episode
-            observer.progress(iteration, "sample", len(episodes), len(plans))
-        executor.hand_over([spool.path(number) for number in episodes])
-    if not episodes:
+            kept.add(episode.summary["episode_id"][0].as_py())
+            observer.progress(iteration, "sample", len(kept), len(plans))
+        files = [spool.path(number) for number in sorted(kept)]
+        executor.hand_over(files)
+    if not kept:
         raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
     if config.run.pipelined and iteration + 1 < config.run.iterations:
         _sample_ahead(config, run, executor, iteration + 1)
@@ -129,11 +130,11 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase, done, total)
     learned, classes = executor.ask("report")
-    ordered = [episodes[plan.episode_id] for plan in plans if plan.episode_id in episodes]
+    episodes = [read(path) for path in files]
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
-    row |= _sampled(ordered) | learned | durations
-    row["left_out"] = len(plans) - len(ordered)
-    tables.commit_iteration(run, iteration, ordered, row, classes)
+    row |= _sampled(episodes) | learned | durations
+    row["left_out"] = len(plans) - len(episodes)
+    tables.commit_iteration(run, iteration, episodes, row, classes)
     manifest, arrays = executor.ask("state")
     checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
     spool.clear()
