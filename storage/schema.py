@@ -8,6 +8,8 @@ stays the same while the support triangle stays the same. Columns without the wo
 
 from __future__ import annotations
 
+from functools import cache
+
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
@@ -191,25 +193,47 @@ def check(table: pa.Table, schema: pa.Schema, where: str) -> pa.Table:
     here. Raises DataError naming `where` and the first column that is missing, unknown, of another type or length,
     null without permission, or not finite.
     """
-    if table.schema.names != schema.names:
-        raise DataError(f"{where}: columns must be {schema.names}, found {table.schema.names}")
-    for field, column in zip(schema, table.columns, strict=True):
-        if column.type != field.type:
-            raise DataError(f"{where}: column {field.name} must be {field.type}, found {column.type}")
-        if column.null_count and not field.nullable:
-            raise DataError(f"{where}: column {field.name} must not be null, found {column.null_count} nulls")
-        length, floating = vector_length(field), pa.types.is_floating(column.type)
-        for chunk in column.chunks if floating or length is not None else ():
-            numbers = chunk.drop_null() if chunk.null_count else chunk
-            if length is not None:
-                if (np.diff(numbers.offsets.to_numpy()) != length).any():
-                    raise DataError(f"{where}: every entry of column {field.name} must hold {length} numbers")
-                numbers = numbers.flatten()
-                if numbers.null_count:
-                    raise DataError(f"{where}: column {field.name} holds nulls inside its vectors")
-            if not np.isfinite(numbers.to_numpy()).all():
-                raise DataError(f"{where}: column {field.name} holds numbers that are not finite")
+    if not table.schema.equals(schema):
+        if table.schema.names != schema.names:
+            raise DataError(f"{where}: columns must be {schema.names}, found {table.schema.names}")
+        for field, found in zip(schema, table.schema, strict=True):
+            if found.type != field.type:
+                raise DataError(f"{where}: column {field.name} must be {field.type}, found {found.type}")
+    rules = _rules(schema)
+    for batch in table.to_batches():
+        for (name, nullable, length, finite), column in zip(rules, batch.columns, strict=True):
+            if column.null_count and not nullable:
+                raise DataError(f"{where}: column {name} must not be null, found {column.null_count} nulls")
+            if not finite and not np.isfinite(_numbers(column, length, where, name).to_numpy()).all():
+                raise DataError(f"{where}: column {name} holds numbers that are not finite")
     return table
+
+
+def _numbers(column: pa.Array, length: int | None, where: str, name: str) -> pa.Array:
+    """What the entries that are not null hold, one after the other."""
+    entries = column.drop_null() if column.null_count else column
+    if length is None:
+        return entries
+    offsets = entries.offsets.to_numpy()
+    if (offsets[1:] - offsets[:-1] != length).any():
+        raise DataError(f"{where}: every entry of column {name} must hold {length} numbers")
+    numbers = entries.values.slice(offsets[0], offsets[-1] - offsets[0])
+    if numbers.null_count:
+        raise DataError(f"{where}: column {name} holds nulls inside its vectors")
+    return numbers
+
+
+@cache
+def _rules(schema: pa.Schema) -> list[tuple[str, bool, int | None, bool]]:
+    """Of each column: its name, whether it may be null, its length if it holds vectors, whether all it holds is finite.
+
+    Read from a schema once, since every episode is checked.
+    """
+    lengths = [vector_length(field) for field in schema]
+    return [
+        (field.name, field.nullable, length, length is None and not pa.types.is_floating(field.type))
+        for field, length in zip(schema, lengths, strict=True)
+    ]
 
 
 def array(table: pa.Table, name: str) -> NDArray[np.generic]:

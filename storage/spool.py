@@ -10,7 +10,6 @@ import logging
 from pathlib import Path
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from t6gps.storage import durable, ipc, schema
 from t6gps.storage.errors import DataError
@@ -39,7 +38,7 @@ def checked(episode: Episode, iteration: int) -> Episode:
             f"found {episode.frames.num_rows}"
         )
     for name in ("episode_id", "iteration"):
-        if not pc.all(pc.equal(episode.frames.column(name), summary[name])).as_py():
+        if (episode.frames.column(name).to_numpy() != summary[name]).any():
             raise DataError(f"{where}: every frame must have {name} {summary[name]}, as its summary has")
     return episode
 
