@@ -49,6 +49,7 @@ class Arm:
 class Study:
     """Arms and what is asked of them.
 
+    paper_arms   further arms, which learn nothing from fewer steps than the paper's
     quick        overrides that, with `quick_seeds`, end the study within half an hour on two cores
     figures      names of figures in `study_figures.FIGURES`, beside the evaluation and the learning curves
     conditions   worlds (overrides by name) in which each policy is evaluated beside its own
@@ -62,6 +63,11 @@ class Study:
     figures: tuple[str, ...] = ()
     conditions: Mapping[str, tuple[str, ...]] = field(default_factory=dict)
     policies_of: str | None = None
+    paper_arms: Mapping[str, Arm] = field(default_factory=dict)
+
+    def arms_at(self, scale: Scale) -> dict[str, Arm]:
+        """All arms of a scale."""
+        return {**self.arms, **(self.paper_arms if scale is Scale.PAPER else {})}
 
 
 PAPER = ("run.episodes=300", "run.steps=250", "run.iterations=5")
@@ -84,7 +90,7 @@ SHRUNK = ("", "", "learner.prior_samples=500")
 PLAIN = ("plain", ", no shrinkage", "learner.prior_samples=0")
 
 
-def _arms(levels: Mapping[str, tuple[str, ...]], priors: tuple[tuple[str, str, str], ...]) -> dict[str, Arm]:
+def _arms(levels: Mapping[str, tuple[str, ...]], *priors: tuple[str, str, str]) -> dict[str, Arm]:
     """Every level (label -> overrides) at both winch speeds and with each of `priors`, on rough ground."""
     return {
         "-".join(filter(None, (label.replace("+", "-").replace(" ", "-"), winch, prior))): Arm(
@@ -101,7 +107,9 @@ ROUGH_SIZES = {Scale.QUICK: ("run.iterations=10",), Scale.PAPER: ("run.iteration
 ROUGH = Arm("T6-GPS", "rough ground", "rough", sizes=ROUGH_SIZES)
 """The headline run."""
 
-REDUCED_STATES = ("com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables")
+STATES = ("com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables")
+REDUCED_STATES = {state: (f"learner.reduced_state={state}",) for state in STATES}
+HORIZONS = {f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}
 
 FROM_REST = ("task.directions=36", "run.steps=16")
 STANDARD_GPS = (
@@ -168,22 +176,22 @@ CHANGED_WORLDS = {
 STUDIES = {
     "surrogate": Study(
         question="Which reduced state lets the surrogate models lower the cost (paper Sec. V-B, left figure)?",
-        arms=_arms({state: (f"learner.reduced_state={state}",) for state in REDUCED_STATES}, (SHRUNK, PLAIN)),
+        arms=_arms(REDUCED_STATES, SHRUNK),
+        paper_arms=_arms(REDUCED_STATES, PLAIN),
         quick=("run.episodes=30",),
         quick_seeds=2,
     ),
     "modes": Study(
         question="What do several modes per class step change in cost and stuck states (paper Sec. V-B, right figure)?",
-        arms=_arms({"4 modes": ("learner.modes=4",), "1 mode": ("learner.modes=1",)}, (SHRUNK, PLAIN)),
+        arms=_arms({"4 modes": ("learner.modes=4",), "1 mode": ("learner.modes=1",)}, SHRUNK, PLAIN),
         quick=("run.episodes=40",),
         quick_seeds=2,
         figures=("speed_distribution", "modes_per_class"),
     ),
     "horizon": Study(
         question="How long must sub-trajectories be (paper Sec. V-B: 10 to 20 steps alike, 5 worse)?",
-        arms=_arms(
-            {f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}, (SHRUNK, PLAIN)
-        ),
+        arms=_arms(HORIZONS, SHRUNK),
+        paper_arms=_arms(HORIZONS, PLAIN),
         quick=("run.episodes=40",),
         quick_seeds=2,
     ),

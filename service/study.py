@@ -81,9 +81,10 @@ def trials(
     A study that borrows its policies has the runs of the study that trains them. ConfigError where no arm matches, or
     for what no arm can learn from.
     """
-    chosen = {arm: declared for arm, declared in study.arms.items() if fnmatchcase(arm, arms)}
+    allowed = study.arms_at(scale)
+    chosen = {arm: declared for arm, declared in allowed.items() if fnmatchcase(arm, arms)}
     if not chosen:
-        raise ConfigError(f"study {name} has no arm that matches '{arms}'; allowed: {', '.join(study.arms)}")
+        raise ConfigError(f"study {name} has no arm that matches '{arms}' at this scale; allowed: {', '.join(allowed)}")
     size, seeds_n = (study.quick, study.quick_seeds) if scale is Scale.QUICK else (PAPER, PAPER_SEEDS)
     planned = []
     for seed in range(seeds_n if seeds is None else seeds):

@@ -69,7 +69,8 @@ def pair(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, list[Finished]
 def test_every_study_expands_to_each_arm_with_each_seed(name: str, scale: Scale) -> None:
     declared = studies.find(name)
     planned = study.trials(name, declared, scale, seeds=2)
-    assert [(trial.arm, trial.seed) for trial in planned] == [(arm, seed) for seed in (0, 1) for arm in declared.arms]
+    arms = declared.arms_at(scale)
+    assert [(trial.arm, trial.seed) for trial in planned] == [(arm, seed) for seed in (0, 1) for arm in arms]
     for trial in planned:
         catalog.check_name(trial.name)
         assert trial.config.run.seed == trial.seed
@@ -95,7 +96,7 @@ def test_a_quick_study_is_estimated_below_half_an_hour(name: str) -> None:
 def test_a_pattern_chooses_arms() -> None:
     planned = study.trials("horizon", STUDIES["horizon"], Scale.QUICK, 1, arms="*-fast")
     assert [trial.arm for trial in planned] == ["5-steps-fast", "10-steps-fast", "15-steps-fast", "20-steps-fast"]
-    with pytest.raises(ConfigError, match=r"no arm that matches 'fast\*'; allowed: 5-steps-fast"):
+    with pytest.raises(ConfigError, match=r"no arm that matches 'fast\*' at this scale; allowed: 5-steps-fast"):
         study.trials("horizon", STUDIES["horizon"], Scale.QUICK, 1, arms="fast*")
 
 
