@@ -8,6 +8,7 @@
 #define PY_SSIZE_T_CLEAN
 #include <Python.h>
 
+#include <float.h>
 #include <math.h>
 #include <stdlib.h>
 #include <string.h>
@@ -106,7 +107,7 @@ ALL_KINDS static void compress(float *L, size n, size nx, size width, float *u, 
             u[i] = L[i * width + k];
             square = fmaf(u[i], u[i], square);
         }
-        if (!(square > 0)) continue;
+        if (square < FLT_MIN) continue; /* nothing there, as where nothing depends on an entry of x */
         const float diagonal = -copysignf(sqrtf(square), u[k]), scale = 1 / fmaf(-diagonal, u[k], square);
         u[k] -= diagonal;
         memset(along, 0, sizeof(float) * width);
