@@ -176,8 +176,6 @@ class Learner:
         weights = self._target_speed_m_per_s, self._vertical_weight
         residual = cost.residual(rows.state, rows.target, *weights)
         root = cost.root(rows.state.shape[1], self._vertical_weight)
-        deviation, variance = self._deviation(rows, patch)
-        models = lqg.prepare(patch.models, settings.kl_weight, variance)
         improved, predicted = np.full_like(rows.action, np.nan), np.full(len(rows.acts), np.nan, dtype=np.float32)
         chunks = [
             starts[first : first + CHUNK, None] + np.arange(length)
@@ -187,20 +185,24 @@ class Learner:
         leading = self._value if self.snapshot.version >= settings.value_from else None
         sub_trajectories_n = sum(map(len, chunks))
         done, total = 0, sub_trajectories_n + (leading.steps_n if leading else 0)
-        climbed: NDArray[np.float32] | None = None
         if leading:
             for _ in leading.learn(self.snapshot, self._rng(self.snapshot.version, VALUE_STREAM)):
                 done += 1
                 yield done, total
             climbed = np.clip(leading.improved(self.snapshot), *self._command_range_m)
+            F = patch.models.F.astype(np.float32)
 
-        def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
-            given = models, patch.of_row[steps], residual[steps + 1], root
-            if climbed is not None:
+            def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
                 k = climbed[steps] - rows.action[steps]
-                return k, lqg.predicted_change(*given, k)
-            result = lqg.backward_pass(*given, deviation[steps])
-            return result.k, result.predicted_cost_change
+                return k, lqg.predicted_change(F, patch.of_row[steps], residual[steps + 1], root, k)
+
+        else:
+            deviation, variance = self._deviation(rows, patch)
+            models = lqg.prepare(patch.models, settings.kl_weight, variance)
+
+            def improve(steps: NDArray[np.int64]) -> tuple[NDArray[Any], NDArray[Any]]:
+                found = lqg.backward_pass(models, patch.of_row[steps], residual[steps + 1], root, deviation[steps])
+                return found.k, found.predicted_cost_change
 
         with ThreadPoolExecutor(os.cpu_count()) as threads:
             for steps, (k, change) in zip(chunks, threads.map(improve, chunks), strict=True):

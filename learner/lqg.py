@@ -122,16 +122,15 @@ def backward_pass(models: LqgModels, model: Ints, residual: Array, root: Array, 
     return found
 
 
-def predicted_change(models: LqgModels, model: Ints, residual: Array, root: Array, change: Array) -> Array:
+def predicted_change(F: Array, model: Ints, residual: Array, root: Array, change: Array) -> NDArray[np.float32]:
     """Change of the running cost after each step [b, T] (m2/s2) when actions change by `change` [b, T, nu].
 
-    What the models promise of actions from elsewhere, as `Improvement` does of those of the backward pass.
+    What models of slopes F [k, nx, nx + nu] promise of actions from elsewhere, as `Improvement` does of those of the
+    backward pass; the other arguments are its own.
     """
-    nu, nx = models.P.shape[1:]
-    dx, found = np.zeros((len(model), nx), dtype=np.float32), np.empty(model.shape, dtype=np.float32)
+    dx, found = np.zeros((len(model), F.shape[1]), dtype=np.float32), np.empty(model.shape, dtype=np.float32)
     for step, chosen in enumerate(model.T):
-        F, e = models.F[chosen], change[:, step] - np.einsum("bij,bj->bi", models.P[chosen], dx)
-        dx = np.einsum("bij,bj->bi", F[:, :, :nx], dx) + np.einsum("bij,bj->bi", F[:, :, nx + 1 : nx + 1 + nu], e)
+        dx = np.einsum("bij,bj->bi", F[chosen], np.concatenate([dx, change[:, step]], axis=1))
         more = dx @ root.T
         found[:, step] = np.einsum("bi,bi->b", more, residual[:, step] + more / 2)
     return found

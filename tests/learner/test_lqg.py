@@ -127,7 +127,7 @@ def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> N
 def test_what_actions_from_elsewhere_are_promised_is_the_model_rollout_too() -> None:
     case = problem()
     actions = np.random.default_rng(1).normal(0, 0.2, (B, T, NU))
-    found = lqg.predicted_change(lqg.prepare(case.models, C), case.index, case.residual, case.root, actions)
+    found = lqg.predicted_change(case.models.F, case.index, case.residual, case.root, actions)
     for b in range(B):
         assert found[b].sum() == pytest.approx(case.objective(b, actions[b])[0], rel=1e-4)
 
