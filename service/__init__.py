@@ -16,6 +16,7 @@ if "RAY_ADDRESS" not in os.environ:
     # Ray would run the workers at the lowest priority but four: on a busy machine they hardly start.
     os.environ.setdefault("RAY_worker_niceness", "0")
     os.environ.setdefault("RAY_task_events_report_interval_ms", "0")  # nobody asks for the history of calls
+    os.environ.setdefault("RAY_memory_monitor_refresh_ms", "1000")  # four times a second costs a thousandth of a core
     # Processes that fit models wait for the next iteration. Ray would end them after a second, and a new one takes
     # longer to start than the fits take.
     os.environ.setdefault("RAY_idle_worker_killing_time_threshold_ms", "300000")

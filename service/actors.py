@@ -9,12 +9,14 @@ import math
 import signal
 import time
 from collections.abc import Callable, Iterator, Sequence
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import ray
 
-from t6gps.service import cluster, control
+from t6gps.service import channel, cluster, control
+from t6gps.service.channel import Address, Hub
 from t6gps.service.cluster import start_actor
 from t6gps.service.config import Config
 from t6gps.service.control import Control
@@ -36,6 +38,11 @@ class LearnerActor:
         from t6gps.service.serial import new_learner  # it loads torch, and the other actors live in this module too
 
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
+
+    def rest(self, until_cut: Address) -> None:
+        """Do nothing until that line is cut: to wait for calls costs a hundredth of a core (`weights`)."""
+        with suppress(EOFError, OSError), channel.connect(until_cut) as line:
+            channel.receive(line)
 
     def add(self, kept: Sequence[Path]) -> None:
         for path in kept:
@@ -98,7 +105,8 @@ class RayExecutor(Executor):
     def __init__(self, config: Config, run: Run | None = None, make_worker: MakeWorker = RolloutWorker) -> None:
         super().__init__(config, run)
         most = cluster.join_or_start(config)
-        self._transport = RayTransport(make_worker, config.rollout, config.run.cpus_per_worker)
+        self._hub = Hub(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+        self._transport = RayTransport(self._hub, make_worker, config.rollout, config.run.cpus_per_worker)
         self.pool = Pool(
             self._transport,
             self.ledger,
@@ -109,6 +117,7 @@ class RayExecutor(Executor):
             autoscale=config.run.autoscale,
         )
         self._learner: Any = None
+        self._resting: Address | None = None  # the line that is cut to wake the learner
         self._keep: Callable[[Episode], None] | None = None  # while the workers sample ahead
         self._tend()
 
@@ -116,6 +125,9 @@ class RayExecutor(Executor):
         self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
     ) -> Iterator[Episode]:
         self._begin(plans, snapshot, purpose, None)
+        if self._learner is not None and self._resting is None:
+            self._resting = self._hub.open()
+            self._learner.rest.remote(self._resting)
         return self.pool.arrivals()
 
     def sample_ahead(
@@ -165,14 +177,17 @@ class RayExecutor(Executor):
         try:
             self.pool.close(*(("DONE", "") if self.finished else ("STOPPING", "the run was stopped")))
         finally:
-            self._transport.close()
+            self._hub.close()
             ray.shutdown()
             for number, handler in previous.items():
                 signal.signal(number, handler)
 
     @property
     def _of_learner(self) -> Any:
-        """The learner's actor, started when it is first needed."""
+        """The learner's actor, started when it is first needed, and woken."""
+        if self._resting is not None:
+            self._hub.cut(self._resting.number)
+            self._resting = None
         if self._learner is None:
             self._learner = start_actor(LearnerActor, self.config, where=cluster.this_node())
         return self._learner

@@ -26,6 +26,8 @@ LENGTHS = struct.Struct("<QQ")
 """Of the head and of the memory that follows it."""
 INTRODUCTION = struct.Struct("<32sQ")
 """Secret and number."""
+BACKLOG_N = 1024
+"""So many may connect at once."""
 NOTHING = pa.py_buffer(b"")
 """The memory of a message that has none."""
 _log = logging.getLogger(__name__)
@@ -46,9 +48,18 @@ class Address:
         return INTRODUCTION.pack(self.secret, self.number)
 
 
-def connect(address: Address) -> socket.socket:
-    """The worker's end of its line. OSError when nobody listens there."""
-    line = socket.create_connection((address.host, address.port))
+def listen(host: str) -> socket.socket:
+    """A server on a free port of a host."""
+    family = socket.AF_INET6 if ":" in host else socket.AF_INET
+    return socket.create_server((host, 0), family=family, backlog=BACKLOG_N)
+
+
+def connect(address: Address, deadline_s: float | None = None) -> socket.socket:
+    """The end of a line of whoever connects. OSError when nobody listens there.
+
+    deadline_s    how long anything that is done with the line may take (s)
+    """
+    line = socket.create_connection((address.host, address.port), deadline_s)
     line.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
     line.sendall(address.introduction)
     return line
@@ -85,6 +96,12 @@ def _exactly(line: socket.socket, n: int) -> pa.Buffer:
     return buffer
 
 
+def introduced(line: socket.socket, secret: bytes) -> bool:
+    """Hear the first that somebody says who connects; True when it knows the secret."""
+    found, _ = INTRODUCTION.unpack(_exactly(line, INTRODUCTION.size))
+    return hmac.compare_digest(found, secret)
+
+
 class Incoming:
     """The bytes of a line, cut into the pieces that its reader wants: a generator that yields their lengths."""
 
@@ -110,9 +127,8 @@ class Hub:
     """The supervisor's ends of all lines. One thread reads them, so that nobody waits for a line that stalls."""
 
     def __init__(self, host: str) -> None:
-        family = socket.AF_INET6 if ":" in host else socket.AF_INET
-        self._server = socket.create_server((host, 0), family=family)
-        self._host, self._secret = host, secrets.token_bytes(32)
+        self._server = listen(host)
+        self.host, self._secret = host, secrets.token_bytes(32)
         self._lines: dict[int, socket.socket | None] = {}
         self._heard: SimpleQueue[tuple[int, Any, pa.Buffer]] = SimpleQueue()
         self._opened_n, self._closed, self._lock = 0, False, Lock()
@@ -122,7 +138,7 @@ class Hub:
         """Expect one more worker; where it shall connect."""
         self._opened_n += 1
         self._lines[self._opened_n] = None
-        return Address(self._host, self._server.getsockname()[1], self._opened_n, self._secret)
+        return Address(self.host, self._server.getsockname()[1], self._opened_n, self._secret)
 
     def send(self, number: int, head: Any) -> None:
         """Send a message to a worker that was heard of. It is lost if the line is cut: Ray tells how it ended."""

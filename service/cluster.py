@@ -51,7 +51,9 @@ def join_or_start(config: Config) -> int:
         object_store_memory=OBJECT_STORE_BYTES,
         _node_ip_address="127.0.0.1",
     )
-    ray_worker._global_node.kill_log_monitor()  # type: ignore[attr-defined]  # nobody reads what it forwards
+    node: Any = ray_worker._global_node
+    for unused in (node.kill_log_monitor, node.kill_monitor, node.kill_dashboard):  # logs to forward, nodes to start
+        unused(check_alive=False)
     return int(cpus_n / each + 1e-6)
 
 

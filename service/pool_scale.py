@@ -23,7 +23,7 @@ import pyarrow as pa
 import ray
 
 from t6gps.service import channel, seeding
-from t6gps.service.channel import LENGTHS, Address
+from t6gps.service.channel import LENGTHS, Address, Hub
 from t6gps.service.cluster import join_or_start, this_node
 from t6gps.service.config import Config
 from t6gps.service.control import Control
@@ -83,7 +83,7 @@ class SlotsTransport(RayTransport):
     """Workers as slots of a few actors."""
 
     def __init__(self, job: Job, slots_n: int) -> None:
-        super().__init__(_no_worker, job.config.rollout, CPUS_PER_PROCESS)
+        super().__init__(Hub("127.0.0.1"), _no_worker, job.config.rollout, CPUS_PER_PROCESS)
         plain: Any = SlotsActor
         made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
@@ -166,7 +166,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         spent_s = clock.spent_s()
     for actor in transport._actors:
         ray.kill(actor)
-    transport.close()
+    transport._hub.close()
     episodes_n = len(tally.done) - 1
     took_s = tally.done[-1][0] - tally.done[0][0]
     own_s = spent_s["supervisor"] + spent_s["committer"]

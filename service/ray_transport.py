@@ -1,6 +1,6 @@
-"""Workers as Ray actors that pull their weights, and the holder of these weights.
+"""Workers as Ray actors, which pull their weights when a plan names other ones than they have.
 
-A worker asks the holder for a policy when a plan names another than it has. Plans and episodes go past Ray (`channel`).
+Plans and episodes go past Ray (`channel`).
 What Ray cannot do for a process that hangs - show its stacks, end it although it is stopped - is done from outside: on
 this node by the transport itself, on another by a caretaker there.
 """
@@ -20,46 +20,23 @@ import ray
 from ray._private import worker as ray_worker
 from ray._private.state import actors
 
-from t6gps.service import channel, cluster, control, processes
+from t6gps.service import channel, cluster, control, processes, weights
 from t6gps.service.channel import Address, Hub
 from t6gps.service.cluster import start_actor
 from t6gps.service.processes import Process
 from t6gps.service.sampler import Failure, Runner, attempt, policy_digest, settings_digest
 from t6gps.service.transport import Alive, Died, Done, Identity, Ready, Remains, Report, Transport
+from t6gps.service.weights import Weights
 from t6gps.storage import ipc
-from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.settings import RolloutSettings
 
 MakeWorker = Callable[[RolloutSettings], Runner]
-PULL_DEADLINE_S = 10.0
 EXAMINE_DEADLINE_S = 0.6
 """A caretaker that has not answered by then is cut off, and its node with it."""
-HOLDER_PING_S, HOLDER_START_S = 1.0, 60.0
-"""How often the holder is asked for a sign of life, and how long its process may take to start and give one."""
-VERSIONS_HELD_N = 2
+VAIN_PULL_S = 0.2
+"""How long a worker waits after it could not pull its policy: another holder may be named meanwhile."""
 _log = logging.getLogger(__name__)
-
-
-class HolderActor:
-    """Holds the newest weights for whoever asks."""
-
-    def __init__(self) -> None:
-        self._held: dict[int, PolicySnapshot] = {}
-
-    def publish(self, snapshot: PolicySnapshot) -> None:
-        """Take a policy, and forget all but the last ones."""
-        self._held[snapshot.version] = snapshot
-        for version in sorted(self._held)[:-VERSIONS_HELD_N]:
-            del self._held[version]
-
-    def version(self, version: int) -> PolicySnapshot | None:
-        """The policy of that version, None when it is not held."""
-        return self._held.get(version)
-
-    def ping(self) -> int:
-        """Newest version held; -1 for none."""
-        return max(self._held, default=-1)
 
 
 @dataclass(frozen=True)
@@ -73,11 +50,15 @@ class Greeting:
 
 @dataclass(frozen=True)
 class Answer:
-    """What became of a plan: an episode, in the memory beside this, a failure, or nothing for want of the policy."""
+    """What became of a plan: an episode, in the memory beside this, a failure, or nothing for want of the policy.
+
+    unheard    the holder that did not answer
+    """
 
     plan: EpisodePlan
     failure: Failure | None = None
     policy_digest: str = ""
+    unheard: Address | None = None
 
 
 class WorkerActor:
@@ -85,7 +66,7 @@ class WorkerActor:
 
     def __init__(self) -> None:
         self._process = processes.dump_stacks_on_signal()
-        self._holder: Any = None
+        self._holder: Address | None = None
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
@@ -113,21 +94,23 @@ class WorkerActor:
 
     def _run(self, worker: Runner, plan: EpisodePlan) -> tuple[Answer, pa.Buffer]:
         """An answer, and the memory beside it."""
-        snapshot = self._pulled(plan.policy_version)
+        snapshot, unheard = None, None
+        try:
+            snapshot = self._pulled(plan.policy_version)
+        except weights.CUT:
+            unheard = self._holder
         if snapshot is None:
-            return Answer(plan), channel.NOTHING
+            time.sleep(VAIN_PULL_S)
+            return Answer(plan, unheard=unheard), channel.NOTHING
         result = attempt(worker, plan, snapshot)
         if isinstance(result, Failure):
             return Answer(plan, result, self._digest), channel.NOTHING
         return Answer(plan, None, self._digest), ipc.pack(result.frames, result.summary)
 
     def _pulled(self, version: int) -> PolicySnapshot | None:
-        """The policy of that version; None when it cannot be had: another holder will be named then."""
+        """The policy of that version; None when nobody has it."""
         if self._snapshot is None or self._snapshot.version != version:
-            try:
-                self._snapshot = ray.get(self._holder.version.remote(version), timeout=PULL_DEADLINE_S)
-            except ray.exceptions.RayError:
-                return None
+            self._snapshot = None if self._holder is None else weights.pull(self._holder, version)
             if self._snapshot is not None:
                 self._digest = policy_digest(self._snapshot)
         return self._snapshot
@@ -183,39 +166,23 @@ class Remote:
 
 
 class RayTransport(Transport):
-    """Workers as actors, and the holder of the weights, which is replaced from a backup when it dies."""
+    """Workers as actors, with their lines in a hub, and the weights that they pull."""
 
-    def __init__(self, make_worker: MakeWorker, settings: RolloutSettings, cpus_per_worker: float) -> None:
+    def __init__(self, hub: Hub, make_worker: MakeWorker, settings: RolloutSettings, cpus_per_worker: float) -> None:
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
         self._node, self._logs = cluster.this_node(), _logs()
         self._caretakers: dict[str, Any] = {}
-        self._hub = Hub(ray.util.get_node_ip_address())  # type: ignore[no-untyped-call]
+        self._hub = hub
         self._remotes: dict[int, Remote] = {}
         self._at_work: dict[Any, Remote] = {}  # by the call in which it works, which ends with it
         self._looked_s = 0.0
-        self._held: dict[int, PolicySnapshot] = {}
-        self._holder = start_actor(HolderActor, where=self._node)
-        self._holder_pong: Any = None
-        self._holder_pinged_s = 0.0
-        self.holders_n = 1
+        self._weights = Weights(hub.host, self._node)
+        self._holder: Address | None = None  # as the workers know it
 
     def publish(self, snapshot: PolicySnapshot) -> None:
-        """Give the holder the newest policy, and keep it in case the holder dies.
-
-        Nothing is done for a policy that is held. RunError for one that is older than those.
-        """
-        if snapshot.version in self._held:
-            return
-        newest = max(self._held, default=snapshot.version)
-        if snapshot.version < newest:
-            raise RunError(f"policy versions only grow: version {newest} is published, found {snapshot.version}")
-        self._held[snapshot.version] = snapshot
-        for version in sorted(self._held)[:-VERSIONS_HELD_N]:
-            del self._held[version]
-        try:
-            ray.get(self._holder.publish.remote(snapshot), timeout=HOLDER_START_S)
-        except ray.exceptions.RayError:
-            self._replace_holder()
+        """Let the workers pull the newest policy. RunError for one that is older than those that were published."""
+        self._weights.publish(snapshot)
+        self._name_holder()
 
     def start(self, slot: int, incarnation: int) -> Remote:
         address = self._hub.open()
@@ -238,7 +205,8 @@ class RayTransport(Transport):
         reports = [self._report(self._remotes[n], *message) for n, *message in heard if n in self._remotes]
         if time.monotonic() - self._looked_s >= control.TICK_S:
             reports += self._ends()
-            self._watch_holder()
+            self._weights.watch()
+            self._name_holder()
             self._looked_s = time.monotonic()
         return reports
 
@@ -246,9 +214,12 @@ class RayTransport(Transport):
         if said is None:
             return Alive(remote)
         if isinstance(said, Answer):
+            if said.unheard is not None and said.unheard == self._weights.holder:
+                self._weights.replace("does not answer")
             return Done(remote, said.plan, said.failure or _episode(packed), said.policy_digest)
         remote.process, remote.node = said.process, said.node
-        self._hub.send(remote.number, self._holder)
+        if self._holder is not None:
+            self._hub.send(remote.number, self._holder)
         if remote.node != self._node and remote.node not in self._caretakers:
             self._caretakers[remote.node] = start_actor(CaretakerActor, where=remote.node)
         return Ready(remote, said.identity)
@@ -291,9 +262,6 @@ class RayTransport(Transport):
         del self._remotes[handle.number]
         self._at_work = {call: remote for call, remote in self._at_work.items() if remote is not handle}
 
-    def close(self) -> None:
-        self._hub.close()
-
     def placed(self, handle: Remote) -> bool:
         known = actors(handle.actor._actor_id.hex())
         return bool(known) and known["State"] not in ("DEPENDENCIES_UNREADY", "PENDING_CREATION")
@@ -301,31 +269,14 @@ class RayTransport(Transport):
     def free_workers(self) -> int:
         return cluster.free_workers(self._cpus)
 
-    def _watch_holder(self) -> None:
-        silent_s = time.monotonic() - self._holder_pinged_s
-        if self._holder_pong is None:
-            if silent_s >= HOLDER_PING_S:
-                self._holder_pong, self._holder_pinged_s = self._holder.ping.remote(), time.monotonic()
-        elif ray.wait([self._holder_pong], timeout=0)[0]:
-            try:
-                ray.get(self._holder_pong)
-                self._holder_pong = None
-            except ray.exceptions.RayError:
-                self._replace_holder()
-        elif silent_s > HOLDER_START_S:
-            self._replace_holder()
-
-    def _replace_holder(self) -> None:
-        _log.warning("the holder of the weights has died; another one takes its place")
-        ray.kill(self._holder)
-        self._holder = start_actor(HolderActor, where=self._node)
-        for version in sorted(self._held):
-            self._holder.publish.remote(self._held[version])
+    def _name_holder(self) -> None:
+        """Tell the workers where to pull from when that has changed; those that have no line yet, when they have."""
+        if self._weights.holder in (None, self._holder):
+            return
+        self._holder = self._weights.holder
         for remote in self._remotes.values():
-            if remote.node:  # the others have no line yet, and are told when they have
+            if remote.node:
                 self._hub.send(remote.number, self._holder)
-        self._holder_pong, self._holder_pinged_s = None, time.monotonic()
-        self.holders_n += 1
 
 
 def _episode(packed: pa.Buffer) -> Episode | None:

@@ -17,7 +17,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ray
-from ray._private.state import actors
 
 from t6gps.learner import policy
 from t6gps.service import deadlines, seeding
@@ -95,7 +94,9 @@ class Soak:
         os.kill(victim.identity.pid, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
 
     def _measure(self, now: float) -> dict[str, float]:
-        pids = {"driver": os.getpid(), "holder": self._holder_pid()}
+        holder = self.executor._transport._weights.process
+        assert holder is not None
+        pids = {"driver": os.getpid(), "holder": holder.pid}
         found = {"time_min": now / 60}
         for role, pid in pids.items():
             status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
@@ -104,9 +105,6 @@ class Soak:
             found[f"{role}_descriptors"] = len(list(Path(f"/proc/{pid}/fd").iterdir()))
         total, free = (numbers().get("object_store_memory", 0) for numbers in (ray.cluster_resources, _available))
         return found | {"object_store_mb": (total - free) / 2**20}
-
-    def _holder_pid(self) -> int:
-        return int(actors(self.executor._transport._holder._actor_id.hex())["Pid"])
 
     def slope_per_min(self, name: str) -> float:
         """Slope of a straight line through what was measured after the warm-up."""

@@ -21,12 +21,12 @@ import pytest
 import ray
 from house import CONFIG, House, pid, policy
 
-from t6gps.service import bundle, control, deadlines
+from t6gps.service import bundle, control, deadlines, processes, weights
 from t6gps.service.config import Config, parse
 from t6gps.service.ledger import FAILURES_ALLOWED_N
-from t6gps.service.ray_transport import VERSIONS_HELD_N
 from t6gps.service.sampler import policy_digest
 from t6gps.service.slots import Worker
+from t6gps.service.weights import VERSIONS_HELD_N, Weights
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -234,27 +234,47 @@ def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch:
     house.check(list(house.sample()))
 
 
+def another_holder(house: House, before: int) -> bool:
+    """Tick; True when there is one, and it is at work."""
+    house.executor.pool.tick(0.02)
+    held: Weights = house.executor._transport._weights
+    return held.holders_n > before and held.holder is not None
+
+
 def test_t9_the_holder_of_the_weights_dies_and_is_back_with_the_newest(
     house: House, wait_until: Callable[..., None]
 ) -> None:
     transport = house.executor._transport
-    found = []
+    held, found = transport._weights, []
     for episode in house.sample():
         found.append(episode)
         if len(found) == 5:
-            before = transport.holders_n
-            ray.kill(transport._holder)
+            before = held.holders_n
+            ray.kill(held._actor)
     house.check(found)
-
-    def back() -> bool:
-        house.executor.pool.tick(0.02)
-        return transport.holders_n > before
-
-    wait_until(back, 30)
-    assert ray.get(transport._holder.ping.remote()) == house.iteration
+    wait_until(lambda: another_holder(house, before), 30)
+    assert held.holder is not None
+    back = weights.pull(held.holder, house.iteration)
+    assert back is not None
+    assert policy_digest(back) == policy_digest(policy(house.iteration))
     with pytest.raises(RunError, match="versions only grow"):
         transport.publish(replace(policy(0), version=house.iteration - VERSIONS_HELD_N))
     house.check(list(house.sample()))
+
+
+def test_t9_a_holder_that_hangs_is_replaced(
+    house: House, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None]
+) -> None:
+    held = house.executor._transport._weights
+    list(house.sample())
+    before = held.holders_n
+    monkeypatch.setattr(weights, "PUBLISH_DEADLINE_S", 0.5)
+    stopped = held.process
+    assert stopped is not None
+    os.kill(stopped.pid, signal.SIGSTOP)
+    house.check(list(house.sample()))
+    assert held.holders_n > before
+    wait_until(lambda: not processes.command(stopped.pid), 10)
 
 
 def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(house: House) -> None:
