@@ -102,6 +102,11 @@ def introduced(line: socket.socket, secret: bytes) -> bool:
     return hmac.compare_digest(found, secret)
 
 
+@dataclass(frozen=True)
+class Cut:
+    """In the place of a message: the line has ended."""
+
+
 class Incoming:
     """The bytes of a line, cut into the pieces that its reader wants: a generator that yields their lengths."""
 
@@ -121,6 +126,10 @@ class Incoming:
         self._rest = self._rest[received_n:]
         if not self._rest:
             self._want(self._reader.send(self._piece))
+
+    def close(self) -> None:
+        """Let the reader know that nothing follows."""
+        self._reader.close()
 
 
 class Hub:
@@ -148,7 +157,10 @@ class Hub:
             send(line, head)
 
     def hear(self, wait_s: float) -> list[tuple[int, Any, pa.Buffer]]:
-        """Every message since the last call, by the number of its worker; waits up to `wait_s` for a first one."""
+        """Every message since the last call, by the number of its worker, and a `Cut` after the last of a line.
+
+        Waits up to `wait_s` for a first one.
+        """
         found = []
         with suppress(Empty):
             found.append(self._heard.get(wait_s > 0, wait_s))
@@ -186,6 +198,7 @@ class Hub:
                     except Exception as error:  # whatever is wrong with a line, the others are read
                         _log.info("a line to a worker has ended: %r", error)
                         if key.data is not None:
+                            key.data.close()
                             selector.unregister(key.fileobj)
                             key.fileobj.close()  # type: ignore[union-attr]
             for key in selector.get_map().values():
@@ -199,10 +212,13 @@ class Hub:
                 _log.warning("somebody unknown tried to connect as a worker, from %s", line.getpeername())
                 return
             self._lines[number] = line
-        while True:
-            head_n, memory_n = LENGTHS.unpack((yield LENGTHS.size))
-            head = pickle.loads((yield head_n))
-            self._heard.put((number, head, (yield memory_n) if memory_n else NOTHING))
+        try:
+            while True:
+                head_n, memory_n = LENGTHS.unpack((yield LENGTHS.size))
+                head = pickle.loads((yield head_n))
+                self._heard.put((number, head, (yield memory_n) if memory_n else NOTHING))
+        finally:
+            self._heard.put((number, Cut(), NOTHING))
 
 
 def _shut(end: socket.socket) -> None:

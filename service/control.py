@@ -28,7 +28,7 @@ class Control:
     def __init__(self, run: Run | None, workers_most: int) -> None:
         self._run, self._most = run, workers_most
         self._wish_path = None if run is None else run.pool / "wish.json"
-        self._published_s, self._state, self._wrote_n = -PUBLISH_S, "", 0
+        self._published_s, self._state = -PUBLISH_S, ""
         self._seen = self._changed()  # a wish for a process that has ended since
         self._wish_id: str | None = None
 

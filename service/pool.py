@@ -34,7 +34,7 @@ PENDING_AFTER_S = 3.0
 """A process needs so long to start, also where there is room for it."""
 PING_S, PING_DEADLINE_S = 1.0, 20.0
 CAPACITY_S = 1.0
-"""How often the cluster is asked for room."""
+"""How often the cluster is asked for room while somebody needs it."""
 SHRINK_AFTER_S = 30.0
 """Autoscaling gives a worker up after it was not needed for so long: the learner's phases are shorter."""
 
@@ -245,11 +245,11 @@ class Pool:
         return worker.phase == "starting" and not worker.placed and self._free_n < 1
 
     def _scale(self, now: float) -> None:
-        if now - self._asked_s >= CAPACITY_S:
+        starting = [worker for worker in self.workers.values() if worker.phase == "starting"]
+        if (starting or self._autoscale) and now - self._asked_s >= CAPACITY_S:
             self._free_n, self._asked_s = self._transport.free_workers(), now
-            for worker in self.workers.values():
-                starting_s = now - worker.since_s if worker.phase == "starting" else 0.0
-                worker.placed = starting_s < PENDING_AFTER_S or self._transport.placed(worker.handle)
+            for worker in starting:
+                worker.placed = now - worker.since_s < PENDING_AFTER_S or self._transport.placed(worker.handle)
         wish = self._control.wish()
         if wish is not None:
             self.wanted, self._autoscale = wish, None  # scaled by hand: it stays so

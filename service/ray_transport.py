@@ -21,7 +21,7 @@ from ray._private import worker as ray_worker
 from ray._private.state import actors
 
 from t6gps.service import channel, cluster, control, processes, weights
-from t6gps.service.channel import Address, Hub
+from t6gps.service.channel import Address, Cut, Hub
 from t6gps.service.cluster import start_actor
 from t6gps.service.processes import Process
 from t6gps.service.sampler import Failure, Runner, attempt, policy_digest, settings_digest
@@ -34,6 +34,8 @@ from t6gps.workers.settings import RolloutSettings
 MakeWorker = Callable[[RolloutSettings], Runner]
 EXAMINE_DEADLINE_S = 0.6
 """A caretaker that has not answered by then is cut off, and its node with it."""
+LOOK_S = 1.0
+"""How often Ray is asked how everybody is; at once where a line has ended."""
 VAIN_PULL_S = 0.2
 """How long a worker waits after it could not pull its policy: another holder may be named meanwhile."""
 _log = logging.getLogger(__name__)
@@ -162,7 +164,8 @@ class Remote:
         self.node = ""
         self.died = False
         self.exited = False  # it died by leaving, as Ray has seen, or for want of memory
-        self.cut_off = False  # its line broke
+        self.cut = False  # its line has ended, and soon it is known why
+        self.cut_off = False  # its line broke, and nothing else happened to it
 
 
 class RayTransport(Transport):
@@ -175,7 +178,7 @@ class RayTransport(Transport):
         self._hub = hub
         self._remotes: dict[int, Remote] = {}
         self._at_work: dict[Any, Remote] = {}  # by the call in which it works, which ends with it
-        self._looked_s = 0.0
+        self._look_s = 0.0  # when Ray is asked next
         self._weights = Weights(hub.host, self._node)
         self._holder: Address | None = None  # as the workers know it
 
@@ -183,6 +186,7 @@ class RayTransport(Transport):
         """Let the workers pull the newest policy. RunError for one that is older than those that were published."""
         self._weights.publish(snapshot)
         self._name_holder()
+        self._look_s = 0.0
 
     def start(self, slot: int, incarnation: int) -> Remote:
         address = self._hub.open()
@@ -192,6 +196,7 @@ class RayTransport(Transport):
 
     def _started(self, remote: Remote, at_work: Any) -> Remote:
         self._remotes[remote.number] = self._at_work[at_work] = remote
+        self._look_s = 0.0
         return remote
 
     def send(self, handle: Remote, plan: EpisodePlan) -> None:
@@ -201,28 +206,39 @@ class RayTransport(Transport):
         self._hub.send(handle.number, None)
 
     def poll(self, wait_s: float) -> list[Report]:
-        heard = self._hub.hear(wait_s)
-        reports = [self._report(self._remotes[n], *message) for n, *message in heard if n in self._remotes]
-        if time.monotonic() - self._looked_s >= control.TICK_S:
+        reports: list[Report] = []
+        for number, said, packed in self._hub.hear(wait_s):
+            if number in self._remotes:
+                reports += self._reports(self._remotes[number], said, packed)
+        if time.monotonic() >= self._look_s:
             reports += self._ends()
             self._weights.watch()
             self._name_holder()
-            self._looked_s = time.monotonic()
+            self._look_s = time.monotonic() + (control.TICK_S if self._in_motion() else LOOK_S)
         return reports
 
-    def _report(self, remote: Remote, said: Greeting | Answer | None, packed: pa.Buffer) -> Report:
+    def _in_motion(self) -> bool:
+        """True while somebody starts or is about to end: Ray is asked often then."""
+        starting = self._weights.holder is None
+        return starting or any(remote.cut or not remote.node for remote in self._remotes.values())
+
+    def _reports(self, remote: Remote, said: Greeting | Answer | Cut | None, packed: pa.Buffer) -> list[Report]:
         if said is None:
-            return Alive(remote)
+            return [Alive(remote)]
+        if isinstance(said, Cut):
+            remote.cut, self._look_s = True, 0.0
+            return []
         if isinstance(said, Answer):
             if said.unheard is not None and said.unheard == self._weights.holder:
                 self._weights.replace("does not answer")
-            return Done(remote, said.plan, said.failure or _episode(packed), said.policy_digest)
+                self._look_s = 0.0
+            return [Done(remote, said.plan, said.failure or _episode(packed), said.policy_digest)]
         remote.process, remote.node = said.process, said.node
         if self._holder is not None:
             self._hub.send(remote.number, self._holder)
         if remote.node != self._node and remote.node not in self._caretakers:
             self._caretakers[remote.node] = start_actor(CaretakerActor, where=remote.node)
-        return Ready(remote, said.identity)
+        return [Ready(remote, said.identity)]
 
     def _ends(self) -> list[Report]:
         """Of the workers that have ended, and with them the call in which they work."""

@@ -13,7 +13,7 @@ import pyarrow as pa
 import pytest
 
 from t6gps.service import channel
-from t6gps.service.channel import Address, Hub
+from t6gps.service.channel import Address, Cut, Hub
 
 DEADLINE_S = 10.0
 
@@ -82,18 +82,20 @@ def test_a_cut_ends_both_sides_and_what_is_sent_into_it_is_lost(hub: Hub) -> Non
     with connected(hub, address) as line:
         line.shutdown(socket.SHUT_RDWR)
         hub.send(address.number, "lost")
+        assert hub.hear(DEADLINE_S) == [(address.number, Cut(), channel.NOTHING)]
         hub.cut(address.number)
     with connected(hub, address := hub.open()) as line:
         hub.cut(address.number)
+        assert hub.hear(DEADLINE_S) == [(address.number, Cut(), channel.NOTHING)]
         with pytest.raises((EOFError, OSError)):
             channel.receive(line)
 
 
 def test_a_message_that_breaks_off_is_not_heard(hub: Hub) -> None:
-    with connected(hub, hub.open()) as line:
+    address = hub.open()
+    with connected(hub, address) as line:
         line.sendall(channel.LENGTHS.pack(5, 1000) + b"half")
-    with connected(hub, hub.open()):
-        assert hub.hear(0.0) == []
+    assert hub.hear(DEADLINE_S) == [(address.number, Cut(), channel.NOTHING)]
 
 
 def test_a_closed_hub_leaves_no_thread_behind(wait_until: Callable[..., None]) -> None:
