@@ -17,7 +17,8 @@ import numpy as np
 from t6gps.service import config as configuration
 from t6gps.service import pool_latency, pool_scale, seeding
 from t6gps.service.display import console
-from t6gps.service.pool_contenders import Job, Tally, pipes, raw, service
+from t6gps.service.pool_contenders import Job, pipes, raw, service
+from t6gps.service.pool_tally import Tally
 from t6gps.service.serial import new_learner
 from t6gps.storage.errors import ConfigError
 
@@ -38,7 +39,9 @@ def pool(seconds: float = SECONDS, rounds: int = ROUNDS) -> dict[str, float | No
 
     raw_N_steps_per_s            control steps per second of a plain loop in each of N processes
     efficiency_N                 committed control steps per second of the service over those of the same round
-    efficiency_2_pipes, efficiency_2_async_vector_env, efficiency_2_rllib      the same for the peers
+    cpu_efficiency_N             the same for the share of the machine's processor time that goes into simulation
+    efficiency_2_pipes, cpu_efficiency_2_pipes, efficiency_2_async_vector_env, efficiency_2_rllib
+                                 the same for the peers
     cpu_s_per_1000_steps_ROLE    processor time (s) for 1,000 committed steps of two workers
     weight_latency_p95_s         from a new policy to a worker that acts with it (30 versions)
     kill_recovery_p95_s, hang_recovery_p95_s     from SIGKILL or SIGSTOP to the successor's first accepted episode
@@ -77,20 +80,32 @@ def _efficiency(job: Callable[[int], Job], rounds: int) -> dict[str, float | Non
     two = {"raw_2": raw, "efficiency_2": timed_service, "efficiency_2_pipes": pipes} | _peers()
     turns = [(name, job(n), run) for n, contenders in ((1, one), (2, two)) for name, run in contenders.items()]
     speeds: dict[str, list[float]] = {name: [] for name, _, run in turns if run is not None}
+    shares: dict[str, list[float]] = {name: [] for name in speeds}
     for number in range(rounds):
         for name, given, run in turns if number % 2 == 0 else reversed(turns):
             if run is not None:
-                speeds[name].append(run(given).steps_per_s)
-                console.print(f"round {number + 1} of {rounds}: {name} {speeds[name][-1]:.0f} steps/s", highlight=False)
+                tally = run(given)
+                speeds[name].append(tally.steps_per_s)
+                shares[name].append(tally.simulating)
+                words = f"round {number + 1} of {rounds}: {name} {tally.steps_per_s:.0f} steps/s"
+                console.print(
+                    words + (f", simulates {tally.simulating:.2%}" if tally.simulating else ""), highlight=False
+                )
     result: dict[str, float | None] = {}
     for name, given, _ in turns:
         if name.startswith("raw"):
             result[f"{name}_steps_per_s"] = float(np.median(speeds[name]))
         else:
-            reference = np.array(speeds[f"raw_{given.workers}"])
-            result[name] = float(np.median(speeds[name] / reference)) if name in speeds else None
+            result[name] = _ratio(speeds, name, given.workers)
+            if name in shares and all(shares[name]):
+                result[f"cpu_{name}"] = _ratio(shares, name, given.workers)
     medians = {role: float(np.median([spent[role] for spent in cpu_s])) for role in cpu_s[0]}
     return result | {f"cpu_s_per_1000_steps_{role}": seconds for role, seconds in medians.items()}
+
+
+def _ratio(found: dict[str, list[float]], name: str, workers: int) -> float | None:
+    """The median over rounds of a contender's figure over that of the plain loop; None when it took no part."""
+    return float(np.median(found[name] / np.array(found[f"raw_{workers}"]))) if name in found else None
 
 
 def _peers() -> dict[str, Callable[[Job], Tally] | None]:

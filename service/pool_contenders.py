@@ -1,7 +1,6 @@
 """The same episodes in several ways: a plain loop, the service, and processes joined by pipes.
 
-Each takes a job and gives a tally: when how many control steps were done, on the clock of `time.monotonic`, which the
-processes of a machine share. `pool_peers` has the libraries.
+Each takes a job and gives a tally. `pool_peers` has the libraries.
 
     raw       every process runs the next episode of the plan and forgets it: no Ray, nothing sent, nothing kept
     service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk; the learner waits for it
@@ -11,11 +10,13 @@ processes of a machine share. `pool_peers` has the libraries.
 from __future__ import annotations
 
 import multiprocessing
+import os
 import tempfile
 import time
 from collections.abc import Iterator
 from contextlib import closing, contextmanager
 from dataclasses import dataclass
+from functools import partial
 from multiprocessing.connection import Connection, wait
 from pathlib import Path
 from typing import Any
@@ -23,14 +24,14 @@ from typing import Any
 from t6gps.service import control
 from t6gps.service.actors import RayExecutor
 from t6gps.service.config import Config
+from t6gps.service.pool_tally import NotingWorker, Tally, steps_of
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.sampler import Failure, attempt
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import Spool
 from t6gps.workers.settings import RolloutSettings
-from t6gps.workers.worker import RolloutWorker
 
 START_DEADLINE_S = 180.0
 
@@ -55,61 +56,33 @@ class Job:
         return self.config.run.steps
 
 
-class Tally:
-    """Control steps that were done, and when (s)."""
-
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self.done: list[tuple[float, int]] = []
-
-    def add(self, steps: int) -> bool:
-        """So many steps are done now; True when the time is up."""
-        self.done.append((time.monotonic(), steps))
-        return self.is_over
-
-    @property
-    def is_over(self) -> bool:
-        """True when `seconds` have passed since the first entry, and one came after it."""
-        return len(self.done) > 1 and self.done[-1][0] - self.done[0][0] >= self._seconds
-
-    @property
-    def steps_n(self) -> int:
-        """Steps from the first entry on, without its own."""
-        return sum(steps for _, steps in self.done[1:])
-
-    @property
-    def steps_per_s(self) -> float:
-        """Control steps per second from the first entry to the last."""
-        return self.steps_n / (self.done[-1][0] - self.done[0][0])
-
-
-def steps_of(episode: Episode) -> int:
-    """Control steps of an episode."""
-    return int(episode.summary["steps"][0].as_py())
-
-
 def raw(job: Job) -> Tally:
     """A plain loop in each of N processes, which share nothing but the number of the next plan."""
     context = multiprocessing.get_context("spawn")
     number, barrier = context.Value("i", 0), context.Barrier(job.workers)
-    with _processes(job.workers, _loop, job, number, barrier) as connections:
-        each = [_received(connection) for connection in connections]
-    end_s = min(done[-1][0] for done in each)  # later on, fewer processes were at work
+    with (
+        tempfile.TemporaryDirectory() as notes,
+        _processes(job.workers, _loop, job, Path(notes), number, barrier) as connections,
+    ):
+        tallies: list[Tally] = [_received(connection) for connection in connections]
+    end_s = min(tally.done[-1][0] for tally in tallies)  # later on, fewer processes were at work
     merged = Tally(job.seconds)
-    merged.done = sorted(entry for done in each for entry in done if entry[0] <= end_s)
+    merged.done = sorted(entry for tally in tallies for entry in tally.done if entry[0] <= end_s)
+    merged.simulating = sum(tally.simulating for tally in tallies)
     return merged
 
 
-def _loop(connection: Connection, job: Job, number: Any, barrier: Any) -> None:
+def _loop(connection: Connection, job: Job, notes: Path, number: Any, barrier: Any) -> None:
     tally = Tally(job.seconds)
-    with closing(RolloutWorker(job.config.rollout)) as worker:
+    with closing(NotingWorker(job.config.rollout, notes)) as worker:
         barrier.wait(START_DEADLINE_S)
         while not tally.is_over:
             with number.get_lock():
                 plan = job.plans[number.value]
                 number.value += 1
             tally.add(steps_of(worker.run(plan, job.snapshot)))
-    connection.send(tally.done)
+    tally.read([notes / str(os.getpid())])
+    connection.send(tally)
 
 
 def pipes(job: Job) -> Tally:
@@ -117,27 +90,28 @@ def pipes(job: Job) -> Tally:
     tally, plans = Tally(job.seconds), iter(job.plans)
     with (
         tempfile.TemporaryDirectory() as folder,
-        _processes(job.workers, _serve, job.config.rollout, job.snapshot) as connections,
+        tempfile.TemporaryDirectory() as notes,
+        _processes(job.workers, _serve, job.config.rollout, job.snapshot, Path(notes)) as connections,
     ):
         spool = Spool(Path(folder), 0)
         for connection in connections:
             _received(connection)
         for connection in connections:
             connection.send(next(plans))
-        while True:
+        while not tally.is_over:
             ready = wait(connections)
             for connection in [each for each in connections if each in ready]:
                 episode = _received(connection)
                 connection.send(next(plans))
-                if isinstance(episode, Failure):
-                    continue
-                spool.append(episode)
-                if tally.add(steps_of(episode)):
-                    return tally
+                if not isinstance(episode, Failure):
+                    spool.append(episode)
+                    tally.add(steps_of(episode))
+        tally.read(Path(notes).iterdir())
+    return tally
 
 
-def _serve(connection: Connection, settings: RolloutSettings, snapshot: PolicySnapshot) -> None:
-    worker = RolloutWorker(settings)
+def _serve(connection: Connection, settings: RolloutSettings, snapshot: PolicySnapshot, notes: Path) -> None:
+    worker = NotingWorker(settings, notes)
     connection.send("ready")
     while True:
         connection.send(attempt(worker, connection.recv(), snapshot))
@@ -174,7 +148,10 @@ def _received(connection: Connection) -> Any:
 def service(job: Job) -> tuple[Tally, dict[str, float]]:
     """The tally of committed steps, and the processor time of each role meanwhile (s)."""
     tally, clock = Tally(job.seconds), RoleClock()
-    with opened(job.config) as (executor, spool):
+    with (
+        tempfile.TemporaryDirectory() as notes,
+        opened(job.config, make_worker=partial(NotingWorker, folder=Path(notes))) as (executor, spool),
+    ):
         for episode in executor.sample(job.plans, job.snapshot):
             with clock.of("committer"):
                 spool.append(episode)
@@ -182,7 +159,9 @@ def service(job: Job) -> tuple[Tally, dict[str, float]]:
                 break
             if len(tally.done) == 1:
                 clock.start()
-        return tally, clock.spent_s()
+        spent_s = clock.spent_s()
+        tally.read(Path(notes).iterdir())
+    return tally, spent_s
 
 
 @contextmanager

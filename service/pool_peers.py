@@ -19,7 +19,8 @@ from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
-from t6gps.service.pool_contenders import Job, Tally
+from t6gps.service.pool_contenders import Job
+from t6gps.service.pool_tally import Tally
 from t6gps.workers import exploration, policy
 from t6gps.workers.environment import SuperBallEnvironment
 from t6gps.workers.settings import RobotSettings

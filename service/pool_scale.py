@@ -29,7 +29,8 @@ from t6gps.service.config import Config
 from t6gps.service.control import Control
 from t6gps.service.ledger import Ledger
 from t6gps.service.pool import Pool
-from t6gps.service.pool_contenders import Job, Tally, steps_of
+from t6gps.service.pool_contenders import Job
+from t6gps.service.pool_tally import Tally, steps_of
 from t6gps.service.ray_transport import Answer, Greeting, RayTransport, Remote
 from t6gps.service.role_clock import RoleClock
 from t6gps.service.transport import Identity
