@@ -99,7 +99,7 @@ class WorkerActor:
         snapshot, unheard = None, None
         try:
             snapshot = self._pulled(plan.policy_version)
-        except weights.CUT:
+        except weights.NO_ANSWER:
             unheard = self._holder
         if snapshot is None:
             time.sleep(VAIN_PULL_S)

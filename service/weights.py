@@ -28,7 +28,7 @@ PULL_DEADLINE_S, PUBLISH_DEADLINE_S = 10.0, 5.0
 """How long a worker waits for a policy, and the supervisor until the holder has one."""
 START_S = 60.0
 """So long may the holder's process take to start."""
-CUT = (EOFError, OSError)
+NO_ANSWER = (EOFError, OSError)
 """What asking a holder raises that is gone or does not answer."""
 _log = logging.getLogger(__name__)
 
@@ -52,7 +52,7 @@ class HolderActor:
             Thread(target=self._answer, args=(line,), daemon=True).start()
 
     def _answer(self, line: socket.socket) -> None:
-        with line, suppress(*CUT):
+        with line, suppress(*NO_ANSWER):
             line.settimeout(PULL_DEADLINE_S)
             if not channel.introduced(line, self._secret):
                 return
@@ -149,5 +149,5 @@ class Weights:
         try:
             for snapshot in snapshots:
                 _asked(holder, snapshot, PUBLISH_DEADLINE_S)
-        except CUT as error:
+        except NO_ANSWER as error:
             self.replace(f"does not take a policy ({error})")
