@@ -24,8 +24,8 @@ from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
 
 VERSIONS_HELD_N = 2
-PULL_DEADLINE_S, PUBLISH_DEADLINE_S = 10.0, 5.0
-"""How long a worker waits for a policy, and the supervisor until the holder has one."""
+ANSWER_DEADLINE_S = 4.0
+"""How long whoever asks waits in silence. An episode has more time at least (`deadlines`): its worker is not to blame."""
 START_S = 60.0
 """So long may the holder's process take to start."""
 NO_ANSWER = (EOFError, OSError)
@@ -53,7 +53,7 @@ class HolderActor:
 
     def _answer(self, line: socket.socket) -> None:
         with line, suppress(*NO_ANSWER):
-            line.settimeout(PULL_DEADLINE_S)
+            line.settimeout(ANSWER_DEADLINE_S)
             if not channel.introduced(line, self._secret):
                 return
             asked, _ = channel.receive(line)
@@ -71,12 +71,12 @@ def newest(held: dict[int, PolicySnapshot]) -> dict[int, PolicySnapshot]:
 
 def pull(holder: Address, version: int) -> PolicySnapshot | None:
     """The policy of that version, None when the holder has it not. EOFError or OSError when it does not answer."""
-    found: PolicySnapshot | None = _asked(holder, version, PULL_DEADLINE_S)
+    found: PolicySnapshot | None = _asked(holder, version)
     return found
 
 
-def _asked(holder: Address, asked: int | PolicySnapshot, deadline_s: float) -> Any:
-    with channel.connect(holder, deadline_s) as line:
+def _asked(holder: Address, asked: int | PolicySnapshot) -> Any:
+    with channel.connect(holder, ANSWER_DEADLINE_S) as line:
         channel.send(line, asked)
         return channel.receive(line)[0]
 
@@ -148,6 +148,6 @@ class Weights:
     def _give(self, snapshots: list[PolicySnapshot], holder: Address) -> None:
         try:
             for snapshot in snapshots:
-                _asked(holder, snapshot, PUBLISH_DEADLINE_S)
+                _asked(holder, snapshot)
         except NO_ANSWER as error:
             self.replace(f"does not take a policy ({error})")

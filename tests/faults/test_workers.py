@@ -267,7 +267,8 @@ def test_t9_a_holder_that_hangs_is_replaced_when_somebody_misses_it(
     house: House, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None], who: str
 ) -> None:
     held = house.executor._transport._weights
-    monkeypatch.setattr(weights, "PUBLISH_DEADLINE_S", 0.5)
+    monkeypatch.setattr(weights, "ANSWER_DEADLINE_S", 0.5)  # for the supervisor
+    failures_n = house.executor.ledger.counters["failures"]
     episodes = house.sample()
     found = [next(episodes)]
     stopped, before = held.process, held.holders_n
@@ -277,6 +278,7 @@ def test_t9_a_holder_that_hangs_is_replaced_when_somebody_misses_it(
         for worker in house.workers:
             os.kill(pid(worker), signal.SIGKILL)  # their successors have no policy
     house.check(found + list(episodes))
+    assert house.executor.ledger.counters["failures"] == failures_n
     if who == "supervisor":
         house.check(list(house.sample()))
     wait_until(lambda: another_holder(house, before), 30)

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 from t6gps.learner import policy
-from t6gps.service import channel, weights
+from t6gps.service import channel, deadlines, weights
 from t6gps.service.channel import Address
+from t6gps.service.ray_transport import VAIN_PULL_S
 from t6gps.service.sampler import policy_digest
-from t6gps.service.weights import PUBLISH_DEADLINE_S, VERSIONS_HELD_N, HolderActor
+from t6gps.service.weights import ANSWER_DEADLINE_S, VERSIONS_HELD_N, HolderActor
 from t6gps.storage import schema
 from t6gps.workers.topology import CABLES_N
 
@@ -25,7 +26,7 @@ def holder() -> Address:
     address, _ = actor.whereabouts()
     threading.Thread(target=actor.hold, daemon=True).start()
     for version in range(VERSIONS_HELD_N + 1):
-        weights._asked(address, replace(UNTRAINED, version=version), PUBLISH_DEADLINE_S)
+        weights._asked(address, replace(UNTRAINED, version=version))
     return address
 
 
@@ -43,10 +44,14 @@ def test_a_stranger_gets_nothing_and_changes_nothing(holder: Address) -> None:
     with pytest.raises(weights.NO_ANSWER):
         weights.pull(stranger, 1)
     with pytest.raises(weights.NO_ANSWER):
-        weights._asked(stranger, replace(UNTRAINED, version=9), PUBLISH_DEADLINE_S)
+        weights._asked(stranger, replace(UNTRAINED, version=9))
     assert weights.pull(holder, 9) is None
 
 
 def test_nobody_waits_for_one_that_stalls(holder: Address) -> None:
     with channel.connect(holder), channel.connect(holder):  # they never ask
         assert weights.pull(holder, 1) is not None
+
+
+def test_an_episode_has_more_time_than_its_worker_needs_to_miss_the_holder() -> None:
+    assert ANSWER_DEADLINE_S + VAIN_PULL_S < deadlines.SHORTEST_S
