@@ -25,7 +25,7 @@ from t6gps.storage.records import PolicySnapshot
 
 VERSIONS_HELD_N = 2
 ANSWER_DEADLINE_S = 4.0
-"""How long whoever asks waits in silence. An episode has more time at least (`deadlines`): its worker is not to blame."""
+"""How long whoever asks waits in silence. An episode has more time than that: a worker that asks is not to blame."""
 START_S = 60.0
 """So long may the holder's process take to start."""
 NO_ANSWER = (EOFError, OSError)
