@@ -1,6 +1,6 @@
 """The executor that runs workers, learner and weights as Ray actors.
 
-Ray restarts nothing: `pool` replaces workers, the transport replaces the holder of the weights, `run` the learner.
+Ray restarts nothing: `pool` replaces workers, `weights` the holder of the weights, `run` the learner.
 """
 
 from __future__ import annotations

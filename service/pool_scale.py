@@ -83,8 +83,8 @@ def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
 class SlotsTransport(RayTransport):
     """Workers as slots of a few actors."""
 
-    def __init__(self, job: Job, slots_n: int) -> None:
-        super().__init__(Hub("127.0.0.1"), _no_worker, job.config.rollout, CPUS_PER_PROCESS)
+    def __init__(self, hub: Hub, job: Job, slots_n: int) -> None:
+        super().__init__(hub, _no_worker, job.config.rollout, CPUS_PER_PROCESS)
         plain: Any = SlotsActor
         made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
@@ -144,7 +144,8 @@ def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, fl
 def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
     plans = seeding.training_plans(_with_episodes(job.config, round(3 * workers_n * (seconds / EPISODE_S + 2))), 0)
     ledger, clock, tally = _TimedLedger(), RoleClock(), Tally(seconds)
-    transport = SlotsTransport(job, workers_n)
+    hub = Hub("127.0.0.1")
+    transport = SlotsTransport(hub, job, workers_n)
     pool = Pool(transport, ledger, workers_n, "", Control(None, workers_n), lambda _: None)
     with tempfile.TemporaryDirectory() as folder:
         spool = Spool(Path(folder), 0)
@@ -167,7 +168,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         spent_s = clock.spent_s()
     for actor in transport._actors:
         ray.kill(actor)
-    transport._hub.close()
+    hub.close()
     episodes_n = len(tally.done) - 1
     took_s = tally.done[-1][0] - tally.done[0][0]
     own_s = spent_s["supervisor"] + spent_s["committer"]

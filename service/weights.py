@@ -88,13 +88,11 @@ class Weights:
 
     holder       where workers pull, None while it starts
     process      the holder's, None while it starts
-    holders_n    so many were started
     """
 
     def __init__(self, host: str, node: str) -> None:
         self.holder: Address | None = None
         self.process: Process | None = None
-        self.holders_n = 0
         self._host, self._node = host, node
         self._held: dict[int, PolicySnapshot] = {}
         self._start()
@@ -103,7 +101,6 @@ class Weights:
         self._actor = start_actor(HolderActor, self._host, where=self._node)
         self._whereabouts, self._at_work = self._actor.whereabouts.remote(), self._actor.hold.remote()
         self.holder, self.process, self._started_s = None, None, time.monotonic()
-        self.holders_n += 1
 
     def publish(self, snapshot: PolicySnapshot) -> None:
         """Give the holder the newest policy, and keep it in case the holder dies.

@@ -24,6 +24,7 @@ from house import CONFIG, House, pid, policy
 from t6gps.service import bundle, control, deadlines, processes, weights
 from t6gps.service.config import Config, parse
 from t6gps.service.ledger import FAILURES_ALLOWED_N
+from t6gps.service.processes import Process
 from t6gps.service.sampler import policy_digest
 from t6gps.service.slots import Worker
 from t6gps.service.weights import VERSIONS_HELD_N, Weights
@@ -234,11 +235,11 @@ def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch:
     house.check(list(house.sample()))
 
 
-def another_holder(house: House, before: int) -> bool:
+def another_holder(house: House, before: Process) -> bool:
     """Tick; True when there is one, and it is at work."""
     house.executor.pool.tick(0.02)
     held: Weights = house.executor._transport._weights
-    return held.holders_n > before and held.holder is not None
+    return held.process not in (None, before)
 
 
 def test_t9_the_holder_of_the_weights_dies_and_is_back_with_the_newest(
@@ -249,7 +250,7 @@ def test_t9_the_holder_of_the_weights_dies_and_is_back_with_the_newest(
     for episode in house.sample():
         found.append(episode)
         if len(found) == 5:
-            before = held.holders_n
+            before = held.process
             ray.kill(held._actor)
     house.check(found)
     wait_until(lambda: another_holder(house, before), 30)
@@ -271,7 +272,7 @@ def test_t9_a_holder_that_hangs_is_replaced_when_somebody_misses_it(
     failures_n = house.executor.ledger.counters["failures"]
     episodes = house.sample()
     found = [next(episodes)]
-    stopped, before = held.process, held.holders_n
+    stopped = held.process
     assert stopped is not None
     os.kill(stopped.pid, signal.SIGSTOP)
     if who == "worker":
@@ -281,7 +282,7 @@ def test_t9_a_holder_that_hangs_is_replaced_when_somebody_misses_it(
     assert house.executor.ledger.counters["failures"] == failures_n
     if who == "supervisor":
         house.check(list(house.sample()))
-    wait_until(lambda: another_holder(house, before), 30)
+    wait_until(lambda: another_holder(house, stopped), 30)
     wait_until(lambda: not processes.command(stopped.pid), 10)
 
 
