@@ -117,8 +117,8 @@ def _checked_world(config: Config) -> Config:
 
     PhysicsError or TerrainError otherwise.
     """
-    from t6gps.workers.ground import ground
-    from t6gps.workers.start import check_stance
+    from t6gps.workers.episode.start import check_stance
+    from t6gps.workers.ground.ground import ground
 
     check_stance(config.robot)
     spread = config.randomisation

@@ -32,8 +32,9 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_every_folder_with_modules_is_listed_as_a_package() -> None:
-    rooms = {path.parent.name for path in REPOSITORY.glob("*/__init__.py")}
-    assert {f"t6gps.{room}" for room in rooms} == set(SETUPTOOLS["packages"])
+    rooms = SETUPTOOLS["package-dir"].values()
+    folders = {path.parent.relative_to(REPOSITORY) for room in rooms for path in (REPOSITORY / room).rglob("*.py")}
+    assert {"t6gps." + ".".join(folder.parts) for folder in folders} == set(SETUPTOOLS["packages"])
     assert SETUPTOOLS["package-dir"] == {f"t6gps.{room}": room for room in rooms}
 
 
@@ -41,8 +42,8 @@ def test_every_folder_with_modules_is_listed_as_a_package() -> None:
 def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     for room in SETUPTOOLS["package-dir"].values():
-        for module in (REPOSITORY / room).glob("*.py"):
-            assert f"t6gps/{room}/{module.name}" in names
+        for module in (REPOSITORY / room).rglob("*.py"):
+            assert f"t6gps/{module.relative_to(REPOSITORY)}" in names
     for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
         assert f"t6gps/deploy/presets/{preset.name}" in names
     for module in SETUPTOOLS["ext-modules"]:
@@ -57,7 +58,7 @@ def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: P
     path = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
     arguments = ["--root", str(tmp_path / "runs"), "--serial", "--set=run.episodes=2", "--set=run.iterations=1"]
     done = subprocess.run(
-        [sys.executable, "-S", "-m", "t6gps.service.cli", "train", "flat-quick", *arguments, "--set=run.steps=20"],
+        [sys.executable, "-S", "-m", "t6gps.service.cli.main", "train", "flat-quick", *arguments, "--set=run.steps=20"],
         env={**os.environ, "PYTHONPATH": path},
         cwd=tmp_path,
         capture_output=True,

@@ -22,14 +22,14 @@ except ModuleNotFoundError as error:
 
 from t6gps.storage.errors import DataError, UnsoundStateError
 from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
-from t6gps.workers.episode import RunningEpisode
-from t6gps.workers.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE, REST_LENGTH_SCALE_M
-from t6gps.workers.physics import FASTEST_SOUND_M_PER_S, Simulation, nominal_rest_length
+from t6gps.workers.episode.running import RunningEpisode
+from t6gps.workers.episode.start import check_stance
+from t6gps.workers.episode.task import running_cost
+from t6gps.workers.physics.simulation import FASTEST_SOUND_M_PER_S, Simulation, nominal_rest_length
+from t6gps.workers.robot.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE, REST_LENGTH_SCALE_M
+from t6gps.workers.robot.symmetry import CABLE_MAP
+from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
-from t6gps.workers.start import check_stance
-from t6gps.workers.symmetry import CABLE_MAP
-from t6gps.workers.task import running_cost
-from t6gps.workers.topology import BAR_LENGTH_M, CABLES_N
 
 Floats = NDArray[np.float32]
 

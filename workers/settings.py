@@ -3,7 +3,7 @@
 from pydantic import Field, model_validator
 
 from t6gps.storage.settings import Settings
-from t6gps.workers.terrain import STEEPEST_DIFFICULTY
+from t6gps.workers.ground.terrain import STEEPEST_DIFFICULTY
 
 
 class RobotSettings(Settings):

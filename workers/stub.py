@@ -20,7 +20,7 @@ import pyarrow as pa
 from t6gps.storage import schema
 from t6gps.storage.errors import ConfigError, PhysicsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers.bullet import pybullet
+from t6gps.workers.physics.bullet import pybullet
 
 ENDLESS_STEPS_N = 2**31 - 1
 

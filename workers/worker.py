@@ -9,13 +9,13 @@ import numpy as np
 
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
-from t6gps.workers import policy
-from t6gps.workers.physics import Simulation
-from t6gps.workers.randomisation import draw
-from t6gps.workers.recording import Record
-from t6gps.workers.rollout import rollout
+from t6gps.workers.episode import policy
+from t6gps.workers.episode.randomisation import draw
+from t6gps.workers.episode.recording import Record
+from t6gps.workers.episode.rollout import rollout
+from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings
-from t6gps.workers.topology import CABLES_N
 
 LAST_STATES_N = 5
 RANDOMISATION_STREAM = 3

@@ -14,10 +14,11 @@ import pytest
 import ray
 from ray.cluster_utils import Cluster
 
-from t6gps.service import cluster, seeding
-from t6gps.service.actors import RayExecutor
+from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.slots import Worker
+from t6gps.service.execution.ray_executor import RayExecutor
+from t6gps.service.pool.workers import Worker
+from t6gps.service.ray_backend import cluster
 from t6gps.storage import catalog, schema
 from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.workers import stub

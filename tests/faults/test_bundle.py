@@ -10,15 +10,18 @@ from typing import Any
 import numpy as np
 import pytest
 
-from t6gps.service import bundle, cli, run, seeding
+from t6gps.service import seeding
+from t6gps.service.cli import main
 from t6gps.service.config import Config
-from t6gps.service.serial import SerialExecutor
+from t6gps.service.execution.serial import SerialExecutor
+from t6gps.service.pool import crash_bundle
+from t6gps.service.training import loop
 from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import PhysicsError, RunError
-from t6gps.workers.physics import Simulation
-from t6gps.workers.start import SETTLE_STEPS
-from t6gps.workers.state import Array, RobotState
+from t6gps.workers.episode.start import SETTLE_STEPS
+from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.robot.state import Array, RobotState
 
 POISON, STEP = 1, 7
 CONFIG = {
@@ -72,14 +75,14 @@ def this(tmp_path: Path) -> Run:
 def trained(this: Run, poison: set[int]) -> None:
     executor = Executor(Config.model_validate(CONFIG), this, poison)
     try:
-        run.train(executor.config, this, executor, Silent())
+        loop.train(executor.config, this, executor, Silent())
     finally:
         executor.close()
 
 
 def command(monkeypatch: pytest.MonkeyPatch, *arguments: str) -> None:
     monkeypatch.setattr(sys, "argv", ["t6gps", *arguments])
-    cli.main()
+    main.main()
 
 
 def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(
@@ -96,7 +99,7 @@ def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(
     assert ledger["counters"]["quarantined"] == 1
     assert ledger["counters"]["committed"] == 2
     path = this.bundles / f"episode-{POISON}.json"
-    kept = bundle.read(path)
+    kept = crash_bundle.read(path)
     assert kept.plan == seeding.training_plans(Config.model_validate(CONFIG), 0)[POISON]
     assert len(kept.failures) == 3
     for failure in kept.failures:

@@ -17,8 +17,9 @@ import ray
 from house import House, add_node, others, pid, three_nodes
 from ray.cluster_utils import Cluster
 
-from t6gps.service import cluster, control, deadlines, ray_transport
-from t6gps.service.slots import Worker
+from t6gps.service.pool import control, deadlines
+from t6gps.service.pool.workers import Worker
+from t6gps.service.ray_backend import cluster, transport
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -78,7 +79,7 @@ def test_t2_a_worker_that_hangs_on_another_node_is_looked_into_and_ended_there(
 ) -> None:
     house.check(list(house.sample()))  # the deadlines are measured now
     monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
-    monkeypatch.setattr(ray_transport, "EXAMINE_DEADLINE_S", 10.0)  # a busy machine
+    monkeypatch.setattr(transport, "EXAMINE_DEADLINE_S", 10.0)  # a busy machine
     found: list[Episode] = []
     process, struck = 0, -1  # and the episode that hangs
     for episode in house.sample():

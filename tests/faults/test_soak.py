@@ -19,14 +19,15 @@ import pytest
 import ray
 
 from t6gps.learner import policy
-from t6gps.service import deadlines, seeding
-from t6gps.service.actors import RayExecutor
+from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.slots import Worker
+from t6gps.service.execution.ray_executor import RayExecutor
+from t6gps.service.pool import deadlines
+from t6gps.service.pool.workers import Worker
 from t6gps.storage import catalog, durable, schema
 from t6gps.storage.records import EpisodePlan
+from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.stub import StubWorker
-from t6gps.workers.topology import CABLES_N
 
 MINUTES = float(os.environ.get("T6GPS_SOAK_MINUTES", "2"))
 CONFIG = {"run": {"episodes": 100, "steps": 250, "workers": 2, "cpus_per_worker": 0.5}}

@@ -21,13 +21,14 @@ import pytest
 import ray
 from house import CONFIG, House, pid, policy
 
-from t6gps.service import bundle, control, deadlines, processes, weights
 from t6gps.service.config import Config, parse
-from t6gps.service.ledger import FAILURES_ALLOWED_N
-from t6gps.service.processes import Process
-from t6gps.service.sampler import policy_digest
-from t6gps.service.slots import Worker
-from t6gps.service.weights import VERSIONS_HELD_N, Weights
+from t6gps.service.pool import control, crash_bundle, deadlines
+from t6gps.service.pool.attempt import policy_digest
+from t6gps.service.pool.ledger import FAILURES_ALLOWED_N
+from t6gps.service.pool.workers import Worker
+from t6gps.service.ray_backend import policy_server, processes
+from t6gps.service.ray_backend.policy_server import VERSIONS_HELD_N, Weights
+from t6gps.service.ray_backend.processes import Process
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -154,14 +155,14 @@ def test_t3_an_episode_that_raises_three_times_is_left_out_and_can_be_replayed(h
     number = house.order(4, "raise")
     found = list(house.sample())
     house.check(found, without=(number,))
-    kept = bundle.read(house.run.bundles / f"episode-{number}.json")
+    kept = crash_bundle.read(house.run.bundles / f"episode-{number}.json")
     assert len(kept.failures) == 3
     assert kept.failures[0]["error"] == "PhysicsError"
     assert kept.failures[0]["step"] == 10
     assert kept.failures[0]["seed"] == kept.plan.seed
     assert "_raise" in kept.failures[0]["trace"]
     assert policy_digest(kept.snapshot) == policy_digest(policy(house.iteration))
-    again = bundle.replay(kept, partial(StubWorker, orders=house.orders))
+    again = crash_bundle.replay(kept, partial(StubWorker, orders=house.orders))
     assert "was ordered to fail" in str(again)
     house.iteration -= 1
     house.check(list(house.sample()), without=(number,))  # it is not tried again
@@ -228,7 +229,7 @@ def test_a_wish_that_is_not_allowed_changes_nothing(house: House) -> None:
 def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
     house.check(list(house.sample()))  # digests of all workers are compared with every episode
     with monkeypatch.context() as patch:
-        patch.setattr("t6gps.service.actors.policy_digest", lambda _: "another")
+        patch.setattr("t6gps.service.execution.ray_executor.policy_digest", lambda _: "another")
         with pytest.raises(RunError, match="acted with another policy"):
             list(house.sample())
     house.executor.pool.state = "RUNNING"
@@ -255,7 +256,7 @@ def test_t9_the_holder_of_the_weights_dies_and_is_back_with_the_newest(
     house.check(found)
     wait_until(lambda: another_holder(house, before), 30)
     assert held.holder is not None
-    back = weights.pull(held.holder, house.iteration)
+    back = policy_server.pull(held.holder, house.iteration)
     assert back is not None
     assert policy_digest(back) == policy_digest(policy(house.iteration))
     with pytest.raises(RunError, match="versions only grow"):
@@ -268,7 +269,7 @@ def test_t9_a_holder_that_hangs_is_replaced_when_somebody_misses_it(
     house: House, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None], who: str
 ) -> None:
     held = house.executor._transport._weights
-    monkeypatch.setattr(weights, "ANSWER_DEADLINE_S", 0.5)  # for the supervisor
+    monkeypatch.setattr(policy_server, "ANSWER_DEADLINE_S", 0.5)  # for the supervisor
     failures_n = house.executor.ledger.counters["failures"]
     episodes = house.sample()
     found = [next(episodes)]

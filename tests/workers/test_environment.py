@@ -17,8 +17,8 @@ from numpy.typing import NDArray
 from t6gps.storage import schema
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
-from t6gps.workers import physics
 from t6gps.workers.environment import ENVIRONMENT_ID, EPISODE_STEPS, SuperBallEnvironment
+from t6gps.workers.physics import simulation
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 from t6gps.workers.worker import RolloutWorker
 
@@ -83,7 +83,7 @@ def test_the_actions_of_a_rollout_repeat_it_to_the_last_bit(difficulty: float) -
     plan = EpisodePlan(0, 0, 0, 5, 60, terrain_seed=3, terrain_difficulty=difficulty, noise_std_m=0.0, policy_version=0)
     worker = RolloutWorker(RolloutSettings())
     episode = worker.run(
-        plan, PolicySnapshot(0, layers, offset_m=physics.nominal_rest_length(RobotSettings()), scale_m=0.2)
+        plan, PolicySnapshot(0, layers, offset_m=simulation.nominal_rest_length(RobotSettings()), scale_m=0.2)
     )
     worker.close()
     frames = episode.frames
@@ -171,7 +171,7 @@ def test_leaving_the_sound_states_terminates_says_why_and_never_pays(monkeypatch
     environment = SuperBallEnvironment(task=task)
     start, _ = environment.reset(seed=0)
     with monkeypatch.context() as patch:
-        patch.setattr(physics, "FASTEST_SOUND_M_PER_S", 0.0)
+        patch.setattr(simulation, "FASTEST_SOUND_M_PER_S", 0.0)
         observation, reward, terminated, truncated, info = environment.step(np.zeros(24, np.float32))
     assert (terminated, truncated) == (True, False)
     assert "unstable" in info["ended_by"]

@@ -1,0 +1,189 @@
+"""A simulated large pool: what supervisor, ledger and committer cost per episode with 10, 100, 1000 workers.
+
+Supervisor, ledger, spool and the lines between are the real ones, and so are the tables' sizes. A worker is only a
+slot in one of a few actor processes, which sleeps and then sends an episode of random numbers: a thousand processes
+with an interpreter each would need some 80 GB.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import os
+import pickle
+import socket
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import suppress
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import ray
+
+from t6gps.service import seeding
+from t6gps.service.bench.contenders import Job
+from t6gps.service.bench.role_clock import RoleClock
+from t6gps.service.bench.tally import Tally, steps_of
+from t6gps.service.config import Config
+from t6gps.service.pool.control import Control
+from t6gps.service.pool.ledger import Ledger
+from t6gps.service.pool.supervisor import Pool
+from t6gps.service.pool.transport import Identity
+from t6gps.service.ray_backend import channel
+from t6gps.service.ray_backend.channel import LENGTHS, Address, Hub
+from t6gps.service.ray_backend.cluster import join_or_start, this_node
+from t6gps.service.ray_backend.transport import Answer, Greeting, RayTransport, Remote
+from t6gps.storage import ipc
+from t6gps.storage.records import EpisodePlan
+from t6gps.storage.spool import Spool
+from t6gps.workers import stub
+
+PROCESSES_N, CPUS_PER_PROCESS = 4, 0.25
+EPISODE_S = 1.0
+NOTE = (
+    f"pool_N_*: N simulated workers are slots of {PROCESSES_N} real Ray actors with {CPUS_PER_PROCESS} CPUs each; "
+    f"a slot sleeps {EPISODE_S:g} s per episode, nothing is simulated, pulled or checked in it; "
+    "supervisor, ledger, committer and the lines between are real"
+)
+
+
+class SlotsActor:
+    """Many workers in one process, each a call that sleeps."""
+
+    def __init__(self, job: Job) -> None:
+        self._whole = stub.episode(job.plans[0], job.snapshot)
+        self._greeting = Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
+
+    async def work(self, address: Address) -> None:
+        """As WorkerActor.work: sleep for each plan, then send the same numbers under its number."""
+        reader, writer = await asyncio.open_connection(address.host, address.port)
+        writer.write(address.introduction + channel.headed(self._greeting, channel.NOTHING))
+        with suppress(EOFError, OSError):  # until the line is cut
+            while True:
+                head_n, _ = LENGTHS.unpack(await reader.readexactly(LENGTHS.size))
+                plan = pickle.loads(await reader.readexactly(head_n))
+                if plan is None:
+                    writer.write(channel.headed(None, channel.NOTHING))
+                elif isinstance(plan, EpisodePlan):  # nothing is pulled here
+                    await asyncio.sleep(EPISODE_S)
+                    packed = ipc.pack(
+                        *(_renumbered(table, plan) for table in (self._whole.frames, self._whole.summary))
+                    )
+                    writer.writelines((channel.headed(Answer(plan), packed), packed))
+                    await writer.drain()
+
+
+def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
+    column = table.schema.get_field_index("episode_id")
+    field = table.schema.field(column)
+    return table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type))
+
+
+class SlotsTransport(RayTransport):
+    """Workers as slots of a few actors."""
+
+    def __init__(self, hub: Hub, job: Job, slots_n: int) -> None:
+        super().__init__(hub, _no_worker, job.config.rollout, CPUS_PER_PROCESS)
+        plain: Any = SlotsActor
+        made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=slots_n)
+        self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
+
+    def start(self, slot: int, incarnation: int) -> Remote:
+        address, actor = self._hub.open(), self._actors[slot % PROCESSES_N]
+        return self._started(Remote(actor, address.number), actor.work.remote(address))
+
+
+def _no_worker(_: object) -> Any:
+    raise NotImplementedError("slots make no worker")
+
+
+class _TimedLedger(Ledger):
+    """Counts the seconds spent in it per episode's way: lease, arrive, commit."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.spent_s = 0.0
+
+    def _timed(self, call: Callable[[], Any]) -> Any:
+        begin_s = time.thread_time()
+        try:
+            return call()
+        finally:
+            self.spent_s += time.thread_time() - begin_s
+
+    def lease(self, slot: int, incarnation: int) -> EpisodePlan | None:
+        return self._timed(lambda: super(_TimedLedger, self).lease(slot, incarnation))
+
+    def arrive(self, plan: EpisodePlan) -> bool:
+        return self._timed(lambda: super(_TimedLedger, self).arrive(plan))
+
+    def commit(self, episode_id: int) -> None:
+        self._timed(lambda: super(_TimedLedger, self).commit(episode_id))
+
+
+def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, float]:
+    """By number of workers n, over `seconds` of each (keys start with pool_n_).
+
+    asked_episodes_per_s, episodes_per_s     n / EPISODE_S, and what was committed
+    supervisor_ms, ledger_ms, committer_ms   processor time of the main thread per committed episode; the supervisor's
+                                             has Ray's calls from it
+    background_ms                            processor time of Ray's threads in the same process
+    commit_wait_ms                           what the main thread waits while it commits an episode: for the disk, and
+                                             for a core where the machine has other work
+    most_episodes_per_s                      where the main thread has no time left: the sum of the above but for the
+                                             background is a second
+    """
+    join_or_start(job.config)
+    try:
+        return {f"pool_{n}_{key}": value for n in sizes for key, value in _measured(job, n, seconds).items()}
+    finally:
+        ray.shutdown()
+
+
+def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
+    plans = seeding.training_plans(_with_episodes(job.config, round(3 * workers_n * (seconds / EPISODE_S + 2))), 0)
+    ledger, clock, tally = _TimedLedger(), RoleClock(), Tally(seconds)
+    hub = Hub("127.0.0.1")
+    transport = SlotsTransport(hub, job, workers_n)
+    pool = Pool(transport, ledger, workers_n, "", Control(None, workers_n), lambda _: None)
+    with tempfile.TemporaryDirectory() as folder:
+        spool = Spool(Path(folder), 0)
+        while pool.state != "RUNNING":
+            pool.tick(0.1)
+        ledger.open(plans)
+        pool.open({})
+        wait_s = main_s = 0.0
+        for episode in pool.arrivals():
+            begin_s, busy_s = time.monotonic(), time.thread_time()
+            with clock.of("committer"):
+                spool.append(episode)
+            wait_s += time.monotonic() - begin_s - (time.thread_time() - busy_s)
+            if tally.add(steps_of(episode)):
+                break
+            if len(tally.done) == 1:  # from here on it is counted
+                clock.start()
+                ledger.spent_s, wait_s, main_s = 0.0, 0.0, time.thread_time()
+        main_s = time.thread_time() - main_s
+        spent_s = clock.spent_s()
+    for actor in transport._actors:
+        ray.kill(actor)
+    hub.close()
+    episodes_n = len(tally.done) - 1
+    took_s = tally.done[-1][0] - tally.done[0][0]
+    own_s = spent_s["supervisor"] + spent_s["committer"]
+    return {
+        "asked_episodes_per_s": workers_n / EPISODE_S,
+        "episodes_per_s": episodes_n / took_s,
+        "supervisor_ms": 1e3 * (main_s - ledger.spent_s - spent_s["committer"]) / episodes_n,
+        "ledger_ms": 1e3 * ledger.spent_s / episodes_n,
+        "committer_ms": 1e3 * spent_s["committer"] / episodes_n,
+        "background_ms": 1e3 * (own_s - main_s) / episodes_n,
+        "commit_wait_ms": 1e3 * wait_s / episodes_n,
+        "most_episodes_per_s": episodes_n / (main_s + wait_s),
+    }
+
+
+def _with_episodes(config: Config, episodes: int) -> Config:
+    return config.model_copy(update={"run": config.run.model_copy(update={"episodes": episodes})})

@@ -1,0 +1,196 @@
+"""Figures that compare the arms of a study, drawn from the tables and evaluations of its runs."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from itertools import cycle
+from typing import Any
+
+import numpy as np
+import pyarrow.compute as pc
+from matplotlib import rc_context
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import MaxNLocator
+
+from t6gps.service.studies import ground_figures
+from t6gps.service.studies.conduct import Finished
+from t6gps.service.views.run_figures import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, SKY, STYLE, canvas, numbers
+from t6gps.storage import tables
+
+COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, DARK, GREY)
+"""Of the arms of a panel in their order; from the ninth on they come again."""
+QUANTITIES = {
+    "forward_speed_m_per_s": ("speed to the waypoint (m/s)", 1),
+    "stuck_share": ("below 0.05 m/s (%)", 100),
+    "stuck_share_by_distance": ("below 5 cm in 1 s (%)", 100),
+    "waypoints_per_episode": ("waypoints per episode", 1),
+    "cost": ("cost (m²/s²)", 1),
+}
+LEARNING = {"cost": "cost (m²/s²)", "forward_speed_m_per_s": "speed to the waypoint (m/s)"}
+Values = np.ndarray
+
+
+def by_panel(finished: Sequence[Finished]) -> dict[str, dict[str, list[Finished]]]:
+    """Runs by panel and label, in the order of their declaration."""
+    panels: dict[str, dict[str, list[Finished]]] = {}
+    for one in finished:
+        arm = one.trial.declared
+        panels.setdefault(arm.panel, {}).setdefault(arm.label, []).append(one)
+    return panels
+
+
+def evaluations(finished: Sequence[Finished]) -> Figure:
+    """The noise-free policies: a dot per seed, a line from the mean one standard deviation each way."""
+    panels = by_panel(finished)
+    with rc_context(STYLE):
+        heights = [len(labels) + 0.6 for labels in panels.values()]
+        figure = canvas(13, 1.1 + 0.42 * sum(heights))
+        grid = figure.subplots(len(panels), len(QUANTITIES), squeeze=False, height_ratios=heights, sharex="col")
+        for row, (panel, labels) in zip(grid, panels.items(), strict=True):
+            for column, (key, (title, factor)) in enumerate(QUANTITIES.items()):
+                axes = row[column]
+                for place, (runs, colour) in enumerate(zip(labels.values(), cycle(COLOURS), strict=False)):
+                    found = [one.evaluation[key]["mean"] for one in runs]
+                    values = factor * np.array([value for value in found if value is not None])
+                    if len(values):
+                        _dots(axes, place, values, colour)
+                axes.set_yticks(range(len(labels)), list(labels) if column == 0 else [""] * len(labels))
+                axes.set_ylim(len(labels) - 0.4, -0.6)
+                axes.grid(visible=False, axis="y")
+                axes.xaxis.set_major_locator(MaxNLocator(4))
+                axes.set_xlabel(title if panel == list(panels)[-1] else "")
+            row[0].set_title(panel)
+    return figure
+
+
+def _dots(axes: Axes, place: float, values: Values, colour: str) -> None:
+    if len(values) > 1:
+        axes.plot(values.mean() + values.std(ddof=1) * np.array([-1, 1]), [place, place], color=colour, alpha=0.5)
+        axes.plot(values.mean(), place, color=colour, marker="|", markersize=13, markeredgewidth=2)
+    axes.plot(values, np.full(len(values), place), color=colour, marker="o", linestyle="", markersize=4.5, alpha=0.8)
+
+
+def learning(finished: Sequence[Finished]) -> Figure:
+    """Cost and speed of the samples of each iteration: mean over seeds, and the range of the seeds.
+
+    Over the steps sampled before where iterations differ in size.
+    """
+    learners = [one for one in finished if one.trial.declared.peer is None]
+    panels, same_size = by_panel(learners), len({_iteration_steps(one) for one in learners}) == 1
+    with rc_context(STYLE):
+        figure = canvas(1.5 + 4 * len(panels), 6)
+        grid = figure.subplots(len(LEARNING), len(panels), squeeze=False, sharey="row", sharex=True)
+        for column, (panel, labels) in enumerate(panels.items()):
+            for row, (key, title) in enumerate(LEARNING.items()):
+                axes = grid[row, column]
+                for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
+                    curves = np.array([numbers(_iterations(one), key) for one in runs])
+                    x = np.arange(curves.shape[1]) * (1.0 if same_size else _iteration_steps(runs[0]) / 1000)
+                    axes.fill_between(x, curves.min(axis=0), curves.max(axis=0), color=colour, alpha=0.15, linewidth=0)
+                    axes.plot(x, curves.mean(axis=0), color=colour, marker="o", markersize=4, label=label)
+                if row == 0:
+                    axes.set_title(panel)
+                else:
+                    axes.set_xlabel("iteration" if same_size else "steps sampled before (thousand)")
+                if column == 0:
+                    axes.set_ylabel(title)
+                axes.xaxis.set_major_locator(MaxNLocator(integer=True, min_n_ticks=1))
+        grid[0, -1].legend()
+    return figure
+
+
+def _iteration_steps(one: Finished) -> int:
+    return one.trial.config.run.episodes * one.trial.config.run.steps
+
+
+def _iterations(one: Finished) -> Any:
+    return tables.read(one.run, "iterations").sort_by("iteration")
+
+
+def _newest(one: Finished, table: str, columns: list[str]) -> Any:
+    newest = tables.committed_iterations(one.run) - 1
+    return tables.read(one.run, table, columns, pc.field("iteration") == newest)
+
+
+def speed_distribution(finished: Sequence[Finished]) -> Figure:
+    """Distribution of the forward speed in the samples of the last iteration (paper Sec. V-B, right figure)."""
+    panels = by_panel(finished)
+    bins = np.linspace(-1, 1.6, 66)
+    with rc_context(STYLE):
+        figure = canvas(1.5 + 4 * len(panels), 3.6)
+        for axes, (panel, labels) in zip(
+            figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+        ):
+            for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
+                speeds = [numbers(_newest(one, "frames", ["forward_speed_m_per_s"]), SPEED) for one in runs]
+                axes.hist(np.concatenate(speeds), bins, density=True, histtype="step", color=colour, label=label)
+            axes.axvline(0, color=DARK, linewidth=0.8)
+            axes.set(title=panel, xlabel="speed to the waypoint (m/s)", ylabel="density (s/m)")
+        axes.legend()
+    return figure
+
+
+SPEED = "forward_speed_m_per_s"
+
+
+def modes_per_class(finished: Sequence[Finished]) -> Figure:
+    """Modes per time step of each class in the last iteration over the class's size: one dot per class and seed."""
+    panels = by_panel(finished)
+    with rc_context(STYLE):
+        figure = canvas(1.5 + 4 * len(panels), 3.6)
+        for axes, (panel, labels) in zip(
+            figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
+        ):
+            for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
+                rows = [row for one in runs for row in _newest(one, "classes", CLASS_COLUMNS).to_pylist()]
+                own = [row for row in rows if not row["pooled"]]
+                sizes, modes = [row["segments"] for row in own], [row["modes"] for row in own]
+                axes.plot(sizes, modes, linestyle="", marker="o", alpha=0.6, color=colour, label=label)
+            axes.set(title=panel, xlabel="segments of the class", ylabel="modes per time step", xscale="log")
+        axes.legend()
+    return figure
+
+
+def conditions(finished: Sequence[Finished]) -> Figure:
+    """Speed and stuck share of every arm in its own world and under each condition: a dot per seed."""
+    names = list(finished[0].conditions)
+    arms: dict[str, list[Finished]] = {}
+    for one in finished:
+        arms.setdefault(one.trial.declared.label, []).append(one)
+    chosen = ("forward_speed_m_per_s", "stuck_share_by_distance")
+    with rc_context(STYLE):
+        figure = canvas(9, 1.3 + 0.3 * (len(names) + 1) * len(arms))
+        for axes, key in zip(figure.subplots(1, len(chosen), sharey=True), chosen, strict=True):
+            title, factor = QUANTITIES[key]
+            for shift, (label, runs) in enumerate(arms.items()):
+                colour, lift = COLOURS[shift % len(COLOURS)], 0.7 * (shift - (len(arms) - 1) / 2) / len(arms)
+                axes.plot([], [], color=colour, marker="o", linestyle="", label=label)
+                for place, name in enumerate([None, *names]):
+                    found = [(one.evaluation if name is None else one.conditions[name])[key]["mean"] for one in runs]
+                    _dots(axes, place + lift, factor * np.array(found), colour)
+            axes.set_yticks(range(len(names) + 1), ["as trained", *names])
+            axes.set_ylim(len(names) + 0.6, -0.6)
+            axes.set_xlabel(title)
+        if len(arms) > 1:
+            handles, labels = axes.get_legend_handles_labels()
+            figure.legend(handles, labels, loc="outside upper center", ncols=len(arms))
+    return figure
+
+
+CLASS_COLUMNS = ["kind", "entry_edge", "exit_edge", "segments", "pooled", "modes"]
+
+FIGURES: dict[str, Callable[[Sequence[Finished]], Figure]] = {
+    "evaluations": evaluations,
+    "learning": learning,
+    "speed_distribution": speed_distribution,
+    "modes_per_class": modes_per_class,
+    "conditions": conditions,
+    "ground_track": ground_figures.ground_track,
+    "footprints": ground_figures.footprints,
+    "climb": ground_figures.climb,
+    "climbs": ground_figures.climbs,
+    "any_axis": ground_figures.any_axis,
+    "grades": ground_figures.grades,
+}
+"""Every study has the first two; a study names the others it wants."""

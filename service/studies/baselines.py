@@ -1,0 +1,172 @@
+"""Controllers to compare with: a gait by hand, an evolved open-loop gait, and PPO from stable-baselines3.
+
+Each samples as many control steps as the run's configuration says (PPO rounds them up to whole batches of 2048) and is
+evaluated on the same episodes as T6-GPS. A peer that is interrupted starts anew, since its training is short.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.service import config as configuration
+from t6gps.service import seeding
+from t6gps.service.config import Config
+from t6gps.service.studies.declared import Peer
+from t6gps.service.training import evaluation, session
+from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.views import terminal
+from t6gps.storage import catalog, checkpoint, durable
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.records import EpisodePlan
+from t6gps.workers.episode import gaits
+from t6gps.workers.episode.rollout import Controller, controlled
+from t6gps.workers.physics.simulation import Simulation, nominal_rest_length
+
+Array = NDArray[np.float64]
+Progress = Callable[[int, int], None]
+
+
+PEERS_STREAM = 4
+"""First spawn key below the run's seed; `seeding` has the others."""
+OFFSPRING_N, PARENTS_N = 12, 4
+FIRST_SPREAD, SPREAD_DECAY = 0.5, 0.97
+"""Standard deviation of the first generation, in units of `gaits.WAVE_SCALE_M`, and its factor per generation."""
+EVOLUTION_STEPS = 100
+PPO_OPTIONS: dict[str, Any] = {"n_steps": 2048, "batch_size": 256, "gamma": 0.95, "device": "cpu"}
+"""Beside stable-baselines3's defaults: a horizon of about two seconds, as long as sub-trajectories look ahead."""
+
+
+def complete(peer: Peer, config: Config, this: Run) -> None:
+    """Train a peer with the steps that `config` allows, keep what it learned, and keep its evaluation."""
+    steps = config.run.iterations * config.run.episodes * config.run.steps
+    with catalog.locked(this), terminal.task(f"training {peer.value}") as progress:
+        if peer is Peer.PERIODIC:
+            _keep_gait(this, evolve(config, steps, progress))
+        elif peer is Peer.PPO:
+            model = train_ppo(config, steps, progress)
+            checkpoint.save(this.checkpoints, config.run.iterations, *learner_state(model, config))
+    evaluation.keep(this, evaluate(peer, this, (), serial=True))
+
+
+def evaluate(peer: Peer, this: Run, overrides: Sequence[str], serial: bool) -> Evaluation:
+    """The evaluation of a finished peer on the episodes that any policy of this run would get."""
+    if peer is Peer.PPO:
+        return session.evaluate_newest(this, overrides, serial)
+    config = configuration.parse(this.config_path.read_text(), overrides)
+    nominal_m = nominal_rest_length(config.robot)
+    control = gaits.flop(nominal_m) if peer is Peer.FLOP else gaits.waves(nominal_m, _kept_gait(this))
+    size = config.run
+    plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
+    with Simulation(config.robot) as simulation:
+        summaries = [controlled(simulation, config.rollout, plan, control, 0, nominal_m).summary for plan in plans]
+    return evaluation.summarise(summaries, size.seed)
+
+
+def _keep_gait(this: Run, parameters: Array) -> None:
+    path = this.path / "gait.json"
+    durable.hidden(path).write_text(json.dumps(parameters.tolist()))
+    durable.publish(path)
+
+
+def _kept_gait(this: Run) -> Array:
+    return np.array(json.loads((this.path / "gait.json").read_text()))
+
+
+def evolve(config: Config, steps: int, progress: Progress) -> Array:
+    """Parameters [49] of the open-loop gait that travels fastest along +x, from rest, in at most `steps` control steps.
+
+    A (4, 12) evolution strategy with a spread that shrinks. RunError if the steps make up no generation.
+    """
+    generations = steps // (OFFSPRING_N * EVOLUTION_STEPS)
+    if not generations:
+        raise RunError(f"{steps} steps make up no generation of {OFFSPRING_N} x {EVOLUTION_STEPS}; allow more steps")
+    rng = np.random.default_rng(np.random.SeedSequence(config.run.seed, spawn_key=(PEERS_STREAM,)))
+    settings = config.rollout
+    terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": ""})
+    settings = settings.model_copy(
+        update={"task": settings.task.model_copy(update={"directions": 1}), "terrain": terrain}
+    )
+    nominal_m = nominal_rest_length(config.robot)
+    plan = EpisodePlan(0, 0, 0, 0, EVOLUTION_STEPS, 0, 0.0, 0.0, 0)
+    mean, spread = np.zeros(gaits.WAVE_PARAMETERS_N), FIRST_SPREAD
+    best, fastest = mean, -np.inf
+    with Simulation(config.robot) as simulation:
+
+        def speed(parameters: Array) -> float:
+            control: Controller = gaits.waves(nominal_m, parameters)
+            summary = controlled(simulation, settings, plan, control, 0, nominal_m).summary
+            return float(summary["forward_speed_m_per_s"][0].as_py())
+
+        for generation in range(generations):
+            offspring = mean + spread * rng.standard_normal((OFFSPRING_N, len(mean)))
+            speeds = np.array([speed(parameters) for parameters in offspring])
+            order = np.argsort(-speeds)
+            mean, spread = offspring[order[:PARENTS_N]].mean(axis=0), spread * SPREAD_DECAY
+            if speeds[order[0]] > fastest:
+                best, fastest = offspring[order[0]], speeds[order[0]]
+            progress(generation + 1, generations)
+    return best
+
+
+def train_ppo(config: Config, steps: int, progress: Progress) -> Any:
+    """The PPO model that `steps` steps of the Gymnasium environment make. ConfigError without stable-baselines3."""
+    import torch
+
+    torch.set_num_threads(1)
+    model = new_ppo(config)
+
+    def follow(state: dict[str, Any], _: dict[str, Any]) -> bool:
+        progress(min(state["self"].num_timesteps, steps), steps)
+        return True
+
+    model.learn(steps, callback=follow)
+    model.env.close()
+    return model
+
+
+def new_ppo(config: Config) -> Any:
+    """An untrained PPO model whose actor is a tanh network with the layers of the policy of T6-GPS."""
+    try:
+        from stable_baselines3 import PPO
+    except ModuleNotFoundError as error:
+        raise ConfigError("PPO needs stable-baselines3, which is not installed; run: pip install 't6gps[peers]'") from (
+            error
+        )
+    from gymnasium.wrappers import TimeLimit
+    from torch.nn import Tanh
+
+    from t6gps.workers.environment import SuperBallEnvironment
+
+    environment = TimeLimit(SuperBallEnvironment(config.robot, config.task, config.terrain), config.run.steps)
+    network = {"net_arch": list(config.learner.hidden_layers), "activation_fn": Tanh, "log_std_init": -1.0}
+    return PPO("MlpPolicy", environment, policy_kwargs=network, seed=config.run.seed, **PPO_OPTIONS)
+
+
+def learner_state(model: Any, config: Config) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    """State of a learner (`Learner.restore`) whose policy commands the mean action of a PPO model."""
+    weights, hidden_n = model.policy.state_dict(), len(config.learner.hidden_layers)
+    names = [*(f"mlp_extractor.policy_net.{2 * number}" for number in range(hidden_n)), "action_net"]
+    arrays = {
+        f"layer_{number}_{part}": weights[f"{name}.{part}"].numpy().astype(np.float32)
+        for number, name in enumerate(names)
+        for part in ("weight", "bias")
+    }
+    middle_m = (config.robot.longest_command_m + config.robot.shortest_command_m) / 2
+    half_m = (config.robot.longest_command_m - config.robot.shortest_command_m) / 2
+    offset_m = nominal_rest_length(config.robot)
+    # Actions -1 .. 1 span the commands about their middle; the snapshot puts zero at the nominal rest length.
+    arrays[f"layer_{len(names) - 1}_bias"] += np.float32((middle_m - offset_m) / half_m)
+    manifest = {
+        "version": config.run.iterations,
+        "offset_m": offset_m,
+        "scale_m": half_m,
+        "layers": len(names),
+        "replays": 0,
+    }
+    return manifest, arrays

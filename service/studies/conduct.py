@@ -1,0 +1,244 @@
+"""Conducts a study: its arms times its seeds as ordinary runs, and a folder with what came out.
+
+Running it again goes on where it stopped. A run is finished when its evaluation is kept; an unfinished one is resumed;
+what is there must have the configuration that the study asks for.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from fnmatch import fnmatchcase
+from pathlib import Path
+from typing import Any
+
+from t6gps.service import config as configuration
+from t6gps.service.bench.registry import commit
+from t6gps.service.config import Config
+from t6gps.service.studies import baselines
+from t6gps.service.studies.declared import PAPER, PAPER_SEEDS, Arm, Peer, Scale, Study
+from t6gps.service.training import evaluation, session
+from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.views.terminal import console
+from t6gps.storage import catalog, durable
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError, RunError
+
+ORIGIN = "origin.json"
+"""Beside a run's tables: study, arm and seed, the commits that worked on it, and the seconds they took."""
+SECONDS_PER_STEP = {True: 0.0005, False: 0.0003}
+SECONDS_PER_RUN, SECONDS_PER_CONDITION = 10.0, 5.0
+"""Of two idle cores, on rough and on flat ground, learning included; to start and to draw (for the estimate alone)."""
+
+
+@dataclass(frozen=True)
+class Trial:
+    """One run of a study; `settings` are its overrides of the arm's preset."""
+
+    name: str
+    arm: str
+    declared: Arm
+    seed: int
+    settings: tuple[str, ...]
+    config: Config
+
+    @property
+    def evaluation_steps(self) -> int:
+        """Control steps of its evaluation."""
+        return self.config.run.evaluation_episodes * self.config.run.steps
+
+    @property
+    def training_steps(self) -> int:
+        """Control steps that it learns from, I x N x T; none for a gait made by hand."""
+        size = self.config.run
+        return 0 if self.declared.peer is Peer.FLOP else size.iterations * size.episodes * size.steps
+
+
+@dataclass(frozen=True)
+class Finished:
+    """A trial with what it left: its run, the evaluation of its policy, those under other conditions, its origin."""
+
+    trial: Trial
+    run: Run
+    evaluation: Evaluation
+    conditions: dict[str, Evaluation]
+    origin: dict[str, Any]
+
+
+def trials(
+    name: str,
+    study: Study,
+    scale: Scale,
+    seeds: int | None = None,
+    overrides: Sequence[str] = (),
+    arms: str = "*",
+) -> list[Trial]:
+    """The arms that match a pattern, with every seed; seed by seed, so that a study stopped early is still balanced.
+
+    A study that borrows its policies has the runs of the study that trains them. ConfigError where no arm matches, or
+    for what no arm can learn from.
+    """
+    allowed = study.arms_at(scale)
+    chosen = {arm: declared for arm, declared in allowed.items() if fnmatchcase(arm, arms)}
+    if not chosen:
+        raise ConfigError(f"study {name} has no arm that matches '{arms}' at this scale; allowed: {', '.join(allowed)}")
+    size, seeds_n = (study.quick, study.quick_seeds) if scale is Scale.QUICK else (PAPER, PAPER_SEEDS)
+    planned = []
+    for seed in range(seeds_n if seeds is None else seeds):
+        for arm, declared in chosen.items():
+            settings = (*size, *declared.overrides, *declared.sizes.get(scale, ()), *overrides, f"run.seed={seed}")
+            config = configuration.load(declared.preset, settings)
+            check_learnable(config, f"arm {arm}")
+            planned.append(
+                Trial(f"{study.policies_of or name}-{scale}-{arm}-{seed}", arm, declared, seed, settings, config)
+            )
+    return planned
+
+
+def check_learnable(config: Config, where: str) -> None:
+    """ConfigError when an iteration is too small to fill one segment class."""
+    size, learner = config.run, config.learner
+    needed = learner.smallest_class_segments * learner.longest_segment_steps
+    if size.episodes * size.steps < needed:
+        raise ConfigError(
+            f"{where}: {size.episodes} episodes of {size.steps} steps cannot fill a segment class, which takes "
+            f"learner.smallest_class_segments x learner.longest_segment_steps = {needed} steps; raise run.episodes "
+            "or run.steps, or lower learner.smallest_class_segments"
+        )
+
+
+def conduct(
+    planned: Sequence[Trial], root: Path, study: str, conditions: Mapping[str, tuple[str, ...]], serial: bool
+) -> list[Finished]:
+    """Run what is missing of the trials below `root`, then evaluate each policy under `conditions` (overrides by name).
+
+    Returns the results in the order of the plan. RunError if a run of that name has another configuration, before
+    anything is sampled. Runs that another commit began are kept and said to be so.
+    """
+    present = commit()
+    there = {this.name: this for this in catalog.list_runs(root)}
+    runs = {trial.name: there[trial.name] for trial in planned if trial.name in there}
+    for trial in planned:
+        if trial.name in runs:
+            session.check_unchanged(
+                runs[trial.name], trial.config, "give another --root, or the settings that the study was begun with"
+            )
+    _warn_of_other_commits(list(runs.values()), present)
+    missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]
+    unseen = [
+        (trial, condition)
+        for trial in planned
+        for condition in conditions
+        if trial.name not in runs or evaluation.kept(runs[trial.name], condition) is None
+    ]
+    left_s = estimate_s(missing, 0) + sum(estimate_s([trial], 1) - estimate_s([trial], 0) for trial, _ in unseen)
+    _say(
+        f"{len(planned)} runs, {len(planned) - len(missing)} of them finished, {len(unseen)} evaluations under other "
+        f"conditions to come: about {minutes(left_s)} on two idle cores"
+    )
+    pace = _Pace(left_s)
+    for number, trial in enumerate(missing, len(planned) - len(missing) + 1):
+        _say(f"run {number} of {len(planned)}: arm {trial.arm}, seed {trial.seed}; {minutes(pace.left_s())} left")
+        this = runs.get(trial.name) or catalog.create(root, trial.name, trial.config.to_json())
+        with _recorded(this, {"study": study, "arm": trial.arm, "seed": trial.seed}, present):
+            if trial.declared.peer is None:
+                session.complete(trial.config, this, serial)
+            else:
+                baselines.complete(trial.declared.peer, trial.config, this)
+        pace.done(estimate_s([trial], 0))
+    for number, (trial, condition) in enumerate(unseen, 1):
+        _say(f"condition {number} of {len(unseen)}: {condition}, run {trial.name}; {minutes(pace.left_s())} left")
+        this, peer = catalog.open_run(root, trial.name), trial.declared.peer
+        if peer is None:
+            found = session.evaluate_newest(this, conditions[condition], serial)
+        else:
+            found = baselines.evaluate(peer, this, conditions[condition], serial)
+        evaluation.keep(this, found, condition)
+        pace.done(estimate_s([trial], 1) - estimate_s([trial], 0))
+    return [_finished(root, trial, conditions) for trial in planned]
+
+
+def _finished(root: Path, trial: Trial, conditions: Iterable[str]) -> Finished:
+    this = catalog.open_run(root, trial.name)
+    kept = {condition: evaluation.kept(this, condition) for condition in (None, *conditions)}
+    results = {condition: result for condition, result in kept.items() if result is not None}
+    if len(results) < len(kept):
+        raise RunError(f"run {trial.name} lost an evaluation while the study went on; run the study again")
+    own = results.pop(None)
+    return Finished(trial, this, own, {str(name): result for name, result in results.items()}, origin(this))
+
+
+def origin(this: Run) -> dict[str, Any]:
+    """Where a study's run comes from: {"study", "arm", "seed", "commits", "wall_s", "cores"}."""
+    path = this.path / ORIGIN
+    return json.loads(path.read_text()) if path.exists() else {"commits": [], "wall_s": 0.0}
+
+
+@contextmanager
+def _recorded(this: Run, identity: dict[str, Any], present: str) -> Iterator[None]:
+    """Add the commit and the time of what runs inside to the run's origin, also when it is interrupted."""
+    before, start = origin(this), time.perf_counter()
+    commits = [*before["commits"], *([present] if present not in before["commits"] else [])]
+
+    def keep() -> None:
+        wall_s = before["wall_s"] + time.perf_counter() - start
+        record = {**identity, "commits": commits, "wall_s": round(wall_s, 1), "cores": os.cpu_count()}
+        path = this.path / ORIGIN
+        durable.hidden(path).write_text(json.dumps(record, indent=2) + "\n")
+        durable.publish(path)
+
+    keep()
+    try:
+        yield
+    finally:
+        keep()
+
+
+def _warn_of_other_commits(runs: Sequence[Run], present: str) -> None:
+    for this in runs:
+        others = [found for found in origin(this)["commits"] if found != present]
+        if others:
+            _say(
+                f"warning: run {this.name} comes from commit {', '.join(others)}, this is {present}; its data may "
+                "differ from what this commit samples (another --root starts afresh)",
+                style="yellow",
+            )
+
+
+class _Pace:
+    """The time left: by the estimate until the first part is done, then by the measured pace."""
+
+    def __init__(self, estimate_s: float) -> None:
+        self._left_s, self._done_s, self._start = estimate_s, 0.0, time.monotonic()
+
+    def done(self, estimate_s: float) -> None:
+        self._left_s -= estimate_s
+        self._done_s += estimate_s
+
+    def left_s(self) -> float:
+        slower = (time.monotonic() - self._start) / self._done_s if self._done_s else 1.0
+        return slower * self._left_s
+
+
+def estimate_s(planned: Sequence[Trial], conditions_n: int) -> float:
+    """Seconds of two idle cores for trials and for the evaluation of each under a number of conditions."""
+    total_s = 0.0
+    for trial in planned:
+        step_s = SECONDS_PER_STEP[trial.config.terrain.difficulty > 0]
+        evaluation_s = SECONDS_PER_CONDITION + trial.evaluation_steps * step_s
+        total_s += SECONDS_PER_RUN + (trial.training_steps + trial.evaluation_steps) * step_s
+        total_s += conditions_n * evaluation_s
+    return total_s
+
+
+def minutes(seconds: float) -> str:
+    """A duration for people."""
+    return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
+
+
+def _say(text: str, style: str | None = None) -> None:
+    console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)

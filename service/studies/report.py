@@ -1,0 +1,235 @@
+"""The folder that a study leaves: tables, figures, and a page that says how all of it was made."""
+
+from __future__ import annotations
+
+import csv
+import os
+import shlex
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from t6gps.service.studies.arm_figures import FIGURES
+from t6gps.service.studies.conduct import Finished, Trial, minutes
+from t6gps.service.studies.declared import Study
+from t6gps.service.training.evaluation import EVALUATED
+from t6gps.service.views import run_figures
+from t6gps.storage import durable, tables
+
+Row = dict[str, Any]
+ITERATION_COLUMNS = (
+    "iteration",
+    "cost",
+    "forward_speed_m_per_s",
+    "stuck_share",
+    "waypoints_per_episode",
+    "segments",
+    "classes",
+    "modes",
+    "residual",
+    "predicted_cost_change",
+    "action_change_m",
+)
+DURATIONS = ("segmenting_s", "fitting_s", "backward_pass_s", "supervised_s")
+
+
+def write(out: Path, name: str, study: Study, command: Sequence[str], finished: Sequence[Finished]) -> list[Path]:
+    """Write the study's folder and return its files, the page first."""
+    out.mkdir(parents=True, exist_ok=True)
+    arms = arm_rows(finished)
+    learners = any(one.trial.declared.peer is None for one in finished)
+    drawn = ("evaluations", *(["learning"] if learners else []), *study.figures)
+    pictures = [run_figures.save(FIGURES[figure](finished), out / f"{figure}.png") for figure in drawn]
+    written = {
+        "README.md": _page(name, study, command, finished, arms, pictures),
+        "table.md": markdown(arms),
+    }
+    for file, text in written.items():
+        durable.hidden(out / file).write_text(text, encoding="utf-8")
+        durable.publish(out / file)
+    sheets = {"table.csv": arms, "runs.csv": run_rows(finished)}
+    if learners:
+        sheets["iterations.csv"] = iteration_rows(finished)
+    if study.conditions:
+        sheets["conditions.csv"] = condition_rows(finished)
+    for file, rows in sheets.items():
+        _write_csv(out / file, rows)
+    return [*(out / file for file in (*written, *sheets)), *pictures]
+
+
+def run_rows(finished: Sequence[Finished]) -> list[Row]:
+    """One row per run: its arm and seed, what it sampled, and its evaluation."""
+    rows = []
+    for one in finished:
+        iterations = tables.read(one.run, "iterations").sort_by("iteration").to_pylist()
+        evaluated = {key: one.evaluation.get(key, {}).get("mean") for key in EVALUATED}
+        rows.append(
+            {
+                "run": one.run.name,
+                "arm": one.trial.arm,
+                "seed": one.trial.seed,
+                "steps": one.trial.training_steps,
+                **evaluated,
+                "modes": iterations[-1]["modes"] if iterations else None,
+                "learning_s": sum(row[key] for row in iterations for key in DURATIONS) if iterations else None,
+                "wall_s": one.origin["wall_s"],
+                "commits": " ".join(one.origin["commits"]),
+            }
+        )
+    return rows
+
+
+def arm_rows(finished: Sequence[Finished]) -> list[Row]:
+    """One row per arm: mean over its seeds of each quantity, and the standard deviation between seeds."""
+    rows = run_rows(finished)
+    result = []
+    for arm in dict.fromkeys(row["arm"] for row in rows):
+        own = [row for row in rows if row["arm"] == arm]
+        summary: Row = {"arm": arm, "seeds": len(own), "steps": own[0]["steps"]}
+        summary |= spread_of(own)
+        for key in ("modes", "learning_s", "wall_s"):
+            known = [row[key] for row in own if row[key] is not None]
+            summary[key] = float(np.mean(known)) if known else None
+        result.append(summary)
+    return result
+
+
+def iteration_rows(finished: Sequence[Finished]) -> list[Row]:
+    """One row per run and iteration, from the samples with exploration noise."""
+    return [
+        {"run": one.run.name, "arm": one.trial.arm, "seed": one.trial.seed, **row}
+        for one in finished
+        for row in tables.read(one.run, "iterations", list(ITERATION_COLUMNS)).sort_by("iteration").to_pylist()
+    ]
+
+
+def condition_rows(finished: Sequence[Finished]) -> list[Row]:
+    """One row per run and condition, the run's own world first."""
+    return [
+        {
+            "run": one.run.name,
+            "arm": one.trial.arm,
+            "seed": one.trial.seed,
+            "condition": condition,
+            **{key: result.get(key, {}).get("mean") for key in EVALUATED},
+        }
+        for one in finished
+        for condition, result in {"as trained": one.evaluation, **one.conditions}.items()
+    ]
+
+
+def condition_table(finished: Sequence[Finished]) -> str:
+    """Markdown table of arms and conditions: mean +- standard deviation between seeds."""
+    groups: dict[tuple[str, str], list[Row]] = {}
+    for row in condition_rows(finished):
+        groups.setdefault((row["arm"], row["condition"]), []).append(row)
+    lines = [
+        "| arm | condition | speed to the waypoint (m/s) | below 5 cm in 1 s (%) | cost |",
+        "|---|---|---|---|---|",
+    ]
+    for (arm, condition), rows in groups.items():
+        own = spread_of(rows)
+        cells = (("forward_speed_m_per_s", 3, 1), ("stuck_share_by_distance", 1, 100), ("cost", 3, 1))
+        lines.append(f"| {arm} | {condition} | {' | '.join(_spread(own, *cell) for cell in cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def spread_of(rows: Sequence[Row]) -> Row:
+    """Mean of each evaluated quantity and, from two runs on, its standard deviation."""
+    summary: Row = {}
+    for key in EVALUATED:
+        values = np.array([row[key] for row in rows if row[key] is not None])
+        summary[key] = float(values.mean()) if len(values) else None
+        summary[f"{key}_deviation"] = float(values.std(ddof=1)) if len(values) > 1 else None
+    return summary
+
+
+def _write_csv(path: Path, rows: Sequence[Row]) -> None:
+    with durable.hidden(path).open("w", newline="", encoding="utf-8") as file:
+        writer = csv.DictWriter(file, list(rows[0]))
+        writer.writeheader()
+        writer.writerows(rows)
+    durable.publish(path)
+
+
+def markdown(arms: Sequence[Row]) -> str:
+    """The table of arms: noise-free policies, mean +- standard deviation between seeds."""
+    lines = [
+        "| arm | seeds | steps | speed to the waypoint (m/s) | waypoints per episode | below 0.05 m/s (%) "
+        "| below 5 cm in 1 s (%) | cost | modes | learning (s) |",
+        "|---|---|---|---|---|---|---|---|---|---|",
+    ]
+    for row in arms:
+        cells = [
+            row["arm"],
+            str(row["seeds"]),
+            f"{row['steps']:,}",
+            _spread(row, "forward_speed_m_per_s", 3),
+            _spread(row, "waypoints_per_episode", 2),
+            _spread(row, "stuck_share", 1, 100),
+            _spread(row, "stuck_share_by_distance", 1, 100),
+            _spread(row, "cost", 3),
+            "-" if row["modes"] is None else f"{row['modes']:.2f}",
+            "-" if row["learning_s"] is None else f"{row['learning_s']:.0f}",
+        ]
+        lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines) + "\n"
+
+
+def _spread(row: Row, key: str, digits: int, factor: float = 1.0) -> str:
+    if row[key] is None:
+        return "-"
+    mean, deviation = f"{factor * row[key]:.{digits}f}", row[f"{key}_deviation"]
+    return mean if deviation is None else f"{mean} +- {factor * deviation:.{digits}f}"
+
+
+def _page(
+    name: str,
+    study: Study,
+    command: Sequence[str],
+    finished: Sequence[Finished],
+    arms: Sequence[Row],
+    pictures: Sequence[Path],
+) -> str:
+    trials = [one.trial for one in finished]
+    wall_s = sum(one.origin["wall_s"] for one in finished)
+    commits = sorted({found for one in finished for found in one.origin["commits"]})
+    seeds = sorted({trial.seed for trial in trials})
+    evaluation_n = trials[0].config.run.evaluation_episodes
+    return "\n".join(
+        [
+            f"# Study `{name}`",
+            "",
+            study.question,
+            "",
+            f"    {shlex.join(command)}",
+            "",
+            f"- seeds {', '.join(map(str, seeds))}; commit {', '.join(commits)}",
+            f"- {len(finished)} runs in {minutes(wall_s)} of wall time on a machine with {os.cpu_count()} cores",
+            f"- evaluation: noise-free policy, {evaluation_n} episodes on seeds that training never used",
+            "",
+            "## Result",
+            "",
+            "Noise-free policies, mean +- standard deviation between seeds; modes per class step of the last",
+            "iteration; seconds of learning in a run.",
+            "",
+            markdown(arms),
+            "`table.csv` holds the same, `runs.csv` each run, `iterations.csv` the samples of each iteration.",
+            "",
+            *(["Under other conditions:", "", condition_table(finished)] if study.conditions else []),
+            *(line for picture in pictures for line in (f"![{picture.stem}]({picture.name})", "")),
+            "## Runs",
+            "",
+            "Each is an ordinary run that `t6gps show`, `query` and `render` open; these commands make the same data:",
+            "",
+            *(f"    {shlex.join(train_command(trial))}" for trial in trials if trial.declared.peer is None),
+            "",
+        ]
+    )
+
+
+def train_command(trial: Trial) -> list[str]:
+    """The command that makes the data of a trial on its own."""
+    return ["t6gps", "train", trial.declared.preset, "--run", trial.name, *(f"--set={key}" for key in trial.settings)]

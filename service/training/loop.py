@@ -1,0 +1,174 @@
+"""The training loop: sample, keep, learn, commit, checkpoint (paper Alg. 2, once per iteration).
+
+What a crash leaves behind decides where to go on. Episodes are in the spool as soon as they are acknowledged; an
+iteration's tables are committed once; the checkpoint comes last and the spool is emptied after it. So a resumed run
+takes the newest checkpoint, reads the spooled episodes of its iteration, samples the missing ones and learns again:
+each step depends on seeds alone, and committing an iteration a second time changes nothing.
+
+In a pipelined run the workers begin with an iteration while the learner is still at work on the one before it. What
+they have sampled is in the spool when the iteration's turn comes, which then goes on as a resumed one does.
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+import pyarrow as pa
+
+from t6gps.service import seeding
+from t6gps.service.config import Config
+from t6gps.service.execution.executor import PHASES, Executor
+from t6gps.storage import checkpoint, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import LearnerDiedError, RunError
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.spool import Spool, read
+
+PHASE_TITLES = {
+    "sample": "sampling",
+    "segment": "segmenting",
+    "fit": "fitting",
+    "backward_pass": "backward pass",
+    "supervise": "supervised step",
+    "evaluate": "evaluation",
+}
+DURATION_COLUMNS = {
+    "sample": "sampling_s",
+    "segment": "segmenting_s",
+    "fit": "fitting_s",
+    "backward_pass": "backward_pass_s",
+    "supervise": "supervised_s",
+}
+
+
+LEARNER_DEATHS_ALLOWED_N = 3
+"""So many in one iteration."""
+
+
+class Observer(Protocol):
+    """Whoever watches a run."""
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        """A phase has advanced."""
+
+    def finished(self, row: dict[str, Any]) -> None:
+        """An iteration is committed; `row` goes into the iterations table."""
+
+
+def train(config: Config, run: Run, executor: Executor, observer: Observer) -> None:
+    """Run the iterations that are missing, from the newest checkpoint on.
+
+    A learner that dies is replaced by one that goes on from there, too; LearnerDiedError when that does not help.
+    """
+    deaths_n, resumed = 0, False
+    while True:
+        first = 0
+        try:
+            latest = checkpoint.load_latest(run.checkpoints)
+            if latest is not None:
+                first, manifest, arrays = latest
+                executor.ask("restore", manifest, arrays)
+                executor.ask("recall", run)
+                if not resumed:
+                    executor.ledger.restore(manifest.get("ledger"))
+            resumed = True
+            for iteration in range(first, config.run.iterations):
+                _iterate(config, run, executor, observer, iteration)
+                deaths_n = 0
+            return
+        except LearnerDiedError:
+            deaths_n += 1
+            if deaths_n > LEARNER_DEATHS_ALLOWED_N:
+                raise
+            executor.replace_learner()
+
+
+@dataclass(frozen=True)
+class Batch:
+    """The episodes of one iteration: planned, the numbers of those in the spool, and who acts in the others."""
+
+    plans: list[EpisodePlan]
+    kept: set[int]
+    snapshot: PolicySnapshot
+
+    @property
+    def missing(self) -> list[EpisodePlan]:
+        return [plan for plan in self.plans if plan.episode_id not in self.kept]
+
+
+def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
+    plans = seeding.training_plans(config, spool.iteration)
+    snapshot = executor.ask("policy", plans[0].policy_version)
+    return Batch(plans, set(spool.episodes()), snapshot)
+
+
+def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
+    durations: dict[str, float] = {}
+    with _timed(durations, "sample"):
+        spool = Spool(run.spool, iteration)
+        batch = _batch(config, executor, spool)
+        plans, kept = batch.plans, batch.kept
+        arriving = executor.sample(batch.missing, batch.snapshot)
+        observer.progress(iteration, "sample", len(kept), len(plans))
+        for episode in arriving:
+            spool.append(episode)
+            kept.add(episode.summary["episode_id"][0].as_py())
+            observer.progress(iteration, "sample", len(kept), len(plans))
+        files = [spool.path(number) for number in sorted(kept)]
+        executor.hand_over(files)
+    if not kept:
+        raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
+    if config.run.pipelined and iteration + 1 < config.run.iterations:
+        _sample_ahead(config, run, executor, iteration + 1)
+    for phase in PHASES:
+        with _timed(durations, phase):
+            for done, total in executor.learn(phase):
+                observer.progress(iteration, phase, done, total)
+    learned, classes = executor.ask("report")
+    episodes = [read(path) for path in files]
+    row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
+    row |= _sampled(episodes) | learned | durations
+    row["left_out"] = len(plans) - len(episodes)
+    tables.commit_iteration(run, iteration, episodes, row, classes)
+    manifest, arrays = executor.ask("state")
+    checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
+    spool.clear()
+    observer.finished(row)
+
+
+def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) -> None:
+    spool = Spool(run.spool, iteration)
+    batch = _batch(config, executor, spool)
+    executor.sample_ahead(batch.missing, batch.snapshot, spool.append)
+
+
+@contextmanager
+def _timed(durations: dict[str, float], phase: str) -> Iterator[None]:
+    start = time.perf_counter()
+    yield
+    durations[DURATION_COLUMNS[phase]] = time.perf_counter() - start
+
+
+def _sampled(episodes: list[Episode]) -> dict[str, Any]:
+    """The part of an iteration's row that describes its episodes."""
+    summary = pa.concat_tables([episode.summary for episode in episodes])
+    result: dict[str, Any] = {"episodes": len(episodes), "steps": int(np.sum(summary["steps"].to_numpy()))}
+    for column, error in (
+        ("cost", "cost_standard_error"),
+        ("forward_speed_m_per_s", "forward_speed_standard_error"),
+    ):
+        result[column], result[error] = mean_and_error(summary[column].to_numpy())
+    result["stuck_share"] = float(summary["stuck_share"].to_numpy().mean())
+    result["waypoints_per_episode"] = float(summary["waypoints_reached"].to_numpy().mean())
+    return result
+
+
+def mean_and_error(values: np.ndarray) -> tuple[float, float]:
+    """Mean and standard error over episodes (0 for a single one)."""
+    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
+    return float(values.mean()), float(error)

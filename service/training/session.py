@@ -1,0 +1,115 @@
+"""From a configuration to a finished run, the same for a single training and for a study."""
+
+from __future__ import annotations
+
+import signal
+from collections.abc import Sequence
+from contextlib import closing
+from enum import StrEnum
+from pathlib import Path
+from typing import TYPE_CHECKING
+
+from t6gps.service import config as configuration
+from t6gps.service.config import Config
+from t6gps.service.execution.executor import Executor
+from t6gps.service.training import evaluation, loop
+from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.views import terminal
+from t6gps.storage import catalog, checkpoint
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
+
+if TYPE_CHECKING:
+    from t6gps.workers.physics.simulation import Simulation
+
+
+class Engine(StrEnum):
+    """Simulators of the robot."""
+
+    BULLET = "bullet"
+    MUJOCO = "mujoco"
+
+
+def start_executor(config: Config, serial: bool, this: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
+    """Workers and learner: on Ray, or in this process when `serial` or with another engine; of the run that trains."""
+    executor: Executor
+    if serial or engine is Engine.MUJOCO:
+        from t6gps.service.execution.serial import SerialExecutor
+
+        executor = SerialExecutor(config, this, _simulation(engine))
+    else:
+        from t6gps.service.execution.ray_executor import RayExecutor
+
+        executor = RayExecutor(config, this)
+    _heed_sigterm()
+    return executor
+
+
+def _heed_sigterm() -> None:
+    """Make SIGTERM stop the program as Ctrl-C does: Ray sets other handlers as it starts and stops."""
+    signal.signal(signal.SIGTERM, signal.default_int_handler)
+
+
+def _simulation(engine: Engine) -> type[Simulation]:
+    if engine is Engine.MUJOCO:
+        from t6gps.workers.physics.mujoco_engine import MujocoSimulation
+
+        return MujocoSimulation
+    from t6gps.workers.physics.simulation import Simulation
+
+    return Simulation
+
+
+def check_unchanged(this: Run, config: Config, remedy: str) -> None:
+    """RunError with all differences if the run was created with another configuration (workers aside)."""
+    stored = configuration.parse(this.config_path.read_text())
+    changed = configuration.differences(stored, config)
+    if changed:
+        raise RunError(f"run {this.name} has another configuration: {'; '.join(changed)}; {remedy}")
+
+
+def complete(config: Config, this: Run, serial: bool) -> tuple[Evaluation, list[Path]]:
+    """Train what is missing of a run, evaluate its policy without noise, keep the result and draw the run's figures.
+
+    Returns the evaluation and the pictures. Everything sampled is kept when KeyboardInterrupt comes. A run is removed
+    whose first executor cannot start.
+    """
+    from t6gps.service.views import run_figures
+
+    with catalog.locked(this):
+        try:
+            started = start_executor(config, serial, this)
+        except RunError:
+            catalog.discard_unused(this)
+            raise
+        with closing(started) as executor:
+            with terminal.ProgressDisplay(config.run.iterations) as progress:
+                loop.train(config, this, executor, progress)
+            result = evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+            executor.finished = True
+        _heed_sigterm()
+        evaluation.keep(this, result)
+        return result, run_figures.draw(this, config.terrain)
+
+
+def evaluate_newest(this: Run, overrides: Sequence[str], serial: bool) -> Evaluation:
+    """Evaluate a run's newest policy in the world that `overrides` change, on the seeds of the run's own evaluation."""
+    config = configuration.parse(this.config_path.read_text(), overrides)
+    with closing(restored(config, this, serial)) as executor:
+        return evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+
+
+def restored(config: Config, this: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
+    """An executor whose learner is that of the run's newest checkpoint. RunError if there is none yet."""
+    latest = checkpoint.load_latest(this.checkpoints)
+    if latest is None:
+        raise RunError(f"run {this.name} has no checkpoint yet; let it finish an iteration")
+    executor = start_executor(config, serial, engine=engine)
+    executor.ask("restore", *latest[1:])
+    return executor
+
+
+def evaluated(config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None) -> Evaluation:
+    """Evaluate the executor's policy under a progress bar."""
+    with terminal.ProgressDisplay(config.run.iterations) as progress:
+        return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, progress)

@@ -1,0 +1,41 @@
+"""Laws of joining a cluster: an address that cannot be right is refused at once, in words."""
+
+from __future__ import annotations
+
+import socket
+from pathlib import Path
+
+import pytest
+import ray
+
+from t6gps.service.config import Config
+from t6gps.service.ray_backend import cluster
+from t6gps.service.training import session
+from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
+
+
+@pytest.mark.parametrize("address", ["", "head", "head:", ":6379", "head:ray", "ray://head:10001"])
+def test_what_is_no_address_of_a_head_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(RunError, match="RAY_ADDRESS must be HOST:PORT"):
+        cluster.join_or_start(Config())
+
+
+def test_an_address_at_which_nobody_listens_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+    monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{port}")
+    with pytest.raises(RunError, match=f"no Ray answers at RAY_ADDRESS=127.0.0.1:{port}"):
+        cluster.join_or_start(Config())
+    assert not ray.is_initialized()
+
+
+def test_a_run_whose_cluster_is_not_there_leaves_nothing_behind(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", "head")
+    this = catalog.create(tmp_path, "one", Config().to_json())
+    with pytest.raises(RunError, match="RAY_ADDRESS"):
+        session.complete(Config(), this, serial=False)
+    assert list(tmp_path.iterdir()) == []

@@ -1,0 +1,90 @@
+"""An episode in progress: what the recorded rollout and the Gymnasium environment have in common."""
+
+from __future__ import annotations
+
+from collections import deque
+from math import hypot
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.workers.episode.start import random_start, rest_start
+from t6gps.workers.episode.task import Course, one_direction, random_waypoints
+from t6gps.workers.ground.ground import ground
+from t6gps.workers.physics.observer import observe, survey
+from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation
+from t6gps.workers.robot.support import SupportFrame, enter
+from t6gps.workers.settings import RolloutSettings
+
+SENSOR_STREAM = 4
+"""Branch of an episode's seed; start, course and exploration come first, then the robot (`worker`)."""
+
+
+class RunningEpisode:
+    """The robot on its way; it depends on the arguments and the commands alone, whatever the simulation did before.
+
+    state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
+    waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
+    observation               what a policy may see now [83], with the noise of the sensors if they have any
+    course                    progress along the waypoints
+    noise_rng                 the stream for exploration; start and course have streams of their own
+
+    Observed rest lengths are centred on `nominal_m`, the policy's own, whatever robot it meets. Commands act
+    `delay_steps` control steps after they are given; until then the winches hold. `number` chooses among the
+    directions of the task if it has any. Raises PhysicsError if the robot cannot even start, TerrainError if there is
+    no such ground.
+    """
+
+    def __init__(
+        self,
+        simulation: Simulation,
+        settings: RolloutSettings,
+        seed: int,
+        terrain_seed: int,
+        terrain_difficulty: float,
+        nominal_m: float,
+        delay_steps: int = 0,
+        number: int = 0,
+    ) -> None:
+        robot, task = settings.robot, settings.task
+        start_rng, course_rng, self.noise_rng = np.random.default_rng(seed).spawn(3)
+        terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
+        simulation.set_ground(terrain)
+        self._simulation = simulation
+        self._sensor_noise = settings.randomisation.sensor_noise
+        if self._sensor_noise:
+            self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
+        self._nominal_m = nominal_m
+        self._step = 0
+        if task.directions:
+            self.state = rest_start(simulation, robot)
+            waypoints = one_direction(number, self.state.com[:2], task.directions)
+        else:
+            self.state = random_start(simulation, robot, terrain, start_rng)
+            waypoints = random_waypoints(course_rng, self.state.com[:2], task)
+        self.course = Course(waypoints, task)
+        self._delayed = deque([self.state.rest_lengths] * delay_steps)
+        self._look(None)
+
+    def advance(self, command: NDArray[np.float64]) -> None:
+        """Take one control step under commanded rest lengths [24] (m) in world labels.
+
+        UnsoundStateError if it leaves the range of sound states; then everything but the simulation stays as it was.
+        """
+        self._delayed.append(command)
+        self.state = self._simulation.control_step(self._delayed.popleft())
+        self._step += 1
+        self._look(self.frame)
+
+    def _look(self, previous: SupportFrame | None) -> None:
+        face, x, y, _ = survey(self.state)
+        if previous is None or face != previous.face:
+            self.frame = enter(face, previous, self.state)
+        self.waypoint = self.course.advance(x, y, self._step * CONTROL_STEP_S)
+        way_x, way_y = self.waypoint[0] - x, self.waypoint[1] - y
+        distance = hypot(way_x, way_y)
+        self.target = (way_x / distance, way_y / distance)
+        self.yaw_rad, self.observation = observe(self.state, self.frame, self.target, self._nominal_m)
+        if self._sensor_noise:
+            readings = self.observation[1:]  # the support triangle is known
+            readings += self._sensor_noise * self._sensor_rng.standard_normal(len(readings), dtype=np.float32)
