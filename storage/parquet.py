@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
 import pyarrow as pa
@@ -13,27 +13,38 @@ import pyarrow.parquet as pq
 from t6gps.storage import durable, schema
 
 
-def write(file: Path, groups: Sequence[pa.Table]) -> None:
-    """Write `file` durably, whole or not at all, with one row group per table.
+def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None:
+    """Write `file` durably, whole or not at all, with one row group per table; each is let go when it is written.
 
     Noisy floats, also inside lists, are split by bytes and everything else uses dictionaries: a quarter
     smaller than the defaults.
     """
-    definition = groups[0].schema
     floats = [field for field in definition if pa.types.is_floating(_leaf(field.type))]
-    with pq.ParquetWriter(
-        durable.hidden(file),
-        definition,
-        compression="zstd",
-        compression_level=3,
-        use_dictionary=[field.name for field in definition if field not in floats],
-        use_byte_stream_split=[
-            f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name for field in floats
-        ],
-    ) as writer:
-        for group in groups:
-            writer.write_table(group, row_group_size=max(group.num_rows, 1))
+    try:
+        with pq.ParquetWriter(
+            durable.hidden(file),
+            definition,
+            compression="zstd",
+            compression_level=3,
+            use_dictionary=[field.name for field in definition if field not in floats],
+            use_byte_stream_split=[
+                f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name for field in floats
+            ],
+        ) as writer:
+            for group in groups:
+                writer.write_table(group, row_group_size=max(group.num_rows, 1))
+    except BaseException:
+        durable.hidden(file).unlink(missing_ok=True)
+        raise
     durable.publish(file)
+
+
+def holds(file: Path, groups: Iterable[pa.Table]) -> bool:
+    """True when the row groups of `file` are these tables."""
+    with pq.ParquetFile(file) as found:
+        known = iter(range(found.num_row_groups))
+        same = all((number := next(known, None)) is not None and found.read_row_group(number).equals(g) for g in groups)
+        return same and next(known, None) is None
 
 
 def rows(table: str, files: Sequence[str], iterations_n: int) -> ds.Dataset:

@@ -61,6 +61,11 @@ class Episode:
     packed: pa.Buffer | None = None
 
     @property
+    def episode_id(self) -> int:
+        """Its number in the run."""
+        return int(self.summary.column("episode_id")[0].as_py())
+
+    @property
     def nbytes(self) -> int:
         """Memory that it takes."""
         return int(self.frames.nbytes if self.packed is None else self.packed.size)

@@ -68,7 +68,7 @@ class Spool:
 
     def append(self, episode: Episode) -> None:
         """Keep a `checked` episode; once this returns, it survives a crash. The same one again replaces its file."""
-        path = self.path(episode.summary.column("episode_id")[0].as_py())
+        path = self.path(episode.episode_id)
         packed = episode.packed
         durable.hidden(path).write_bytes(ipc.pack(episode.frames, episode.summary) if packed is None else packed)
         durable.publish(path)
@@ -84,7 +84,7 @@ class Spool:
                 self.torn += 1
                 _log.warning("%s is torn and will be sampled again: %s", path, error)
                 continue
-            whole[episode.summary.column("episode_id")[0].as_py()] = episode
+            whole[episode.episode_id] = episode
         return whole
 
     def clear(self) -> None:

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import json
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
-import pyarrow.parquet as pq
 from deltalake import DeltaTable, Schema
 from deltalake.transaction import AddAction, CommitProperties, PostCommitHookProperties, Transaction
 
@@ -33,11 +32,13 @@ _APPLICATION = "t6gps"
 def commit_iteration(
     run: Run,
     iteration: int,
-    episodes: Sequence[Episode],
+    episodes: Iterable[Episode],
     iteration_row: Mapping[str, object],
     class_rows: Sequence[Mapping[str, object]],
 ) -> None:
     """Commit everything that one iteration leaves behind; once this returns it survives a crash.
+
+    episodes   in ascending order of their numbers; no more than a row group of them is held at a time
 
     An iteration that is committed already is left alone, one that was cut off is completed. Raises DataError
     for data that break their schema, RunError for an iteration out of turn; nothing is written in either
@@ -48,21 +49,34 @@ def commit_iteration(
         return
     if iteration > expected:
         raise RunError(f"{run.path}: iterations are committed in turn; next is {expected}, found {iteration}")
-    if not episodes:
-        raise DataError(f"iteration {iteration} has no episodes; sample at least one")
-    pieces = sorted(episodes, key=_episode_id)
-    if len({_episode_id(episode) for episode in pieces}) < len(pieces):
-        raise DataError(f"iteration {iteration}: an episode was given twice; every episode_id must be unique")
-    size_n = EPISODES_PER_ROW_GROUP_N
-    groups = [pieces[start : start + size_n] for start in range(0, len(pieces), size_n)]
-    summaries = _joined("episodes", [episode.summary for episode in pieces])
     rows = _from_rows("iterations", [iteration_row], iteration)
     classes = _from_rows("classes", class_rows, iteration)
-    frames = [_joined("frames", [episode.frames for episode in group]) for group in groups]
-    _commit(run, "frames", iteration, frames)
+    summaries: list[pa.Table] = []
+    _commit(run, "frames", iteration, _row_groups(episodes, iteration, summaries))
     _commit(run, "classes", iteration, [classes])
     _commit(run, "iterations", iteration, [rows])
-    _commit(run, "episodes", iteration, [summaries])
+    _commit(run, "episodes", iteration, [_joined("episodes", summaries)])
+
+
+def _row_groups(episodes: Iterable[Episode], iteration: int, summaries: list[pa.Table]) -> Iterator[pa.Table]:
+    """Frames of a few episodes at a time; their summaries are added to `summaries`."""
+    newest, group = -1, list[pa.Table]()
+    for episode in episodes:
+        if episode.episode_id <= newest:
+            raise DataError(
+                f"iteration {iteration}: episodes must come in ascending order, each once; "
+                f"found {episode.episode_id} after {newest}"
+            )
+        newest = episode.episode_id
+        summaries.append(episode.summary.take([0]))  # a copy: the episode's memory is not held
+        group.append(episode.frames)
+        if len(group) == EPISODES_PER_ROW_GROUP_N:
+            yield _joined("frames", group)
+            group.clear()
+    if group:
+        yield _joined("frames", group)
+    if not summaries:
+        raise DataError(f"iteration {iteration} has no episodes; sample at least one")
 
 
 def committed_iterations(run: Run) -> int:
@@ -131,10 +145,6 @@ def _files(folder: Path) -> list[str]:
     return [str(folder / name) for name in sorted(actions.column("path").to_pylist())]
 
 
-def _episode_id(episode: Episode) -> int:
-    return int(episode.summary.column("episode_id")[0].as_py())
-
-
 def _joined(table: str, parts: list[pa.Table]) -> pa.Table:
     return pa.concat_tables([part.cast(schema.TABLES[table]) for part in parts])
 
@@ -158,25 +168,25 @@ def _committed(delta: DeltaTable) -> int:
     return 0 if version is None else version + 1
 
 
-def _commit(run: Run, table: str, iteration: int, groups: list[pa.Table]) -> None:
+def _commit(run: Run, table: str, iteration: int, groups: Iterable[pa.Table]) -> None:
     """Add the file of one iteration to one table, unless it is there already."""
     folder = run.tables / table
     definition = Schema.from_arrow(schema.TABLES[table])
-    if DeltaTable.is_deltatable(str(folder)):
-        delta = DeltaTable(str(folder))
-    else:
-        delta = DeltaTable.create(str(folder), definition)
     file = folder / f"iteration-{iteration:06d}.parquet"
-    if iteration < _committed(delta):
-        if table == "frames" and not pq.read_table(file).equals(pa.concat_tables(groups)):
+    delta = DeltaTable(str(folder)) if DeltaTable.is_deltatable(str(folder)) else None
+    if delta and iteration < _committed(delta):
+        if table == "frames" and not parquet.holds(file, groups):
             raise DataError(
                 f"{file} holds other episodes than those to be committed: the spool of iteration {iteration} "
                 "was changed after the crash; restore it, or continue in a new run"
             )
         return
-    parquet.write(file, groups)
+    statistics = _Statistics()
+    folder.mkdir(exist_ok=True)
+    parquet.write(file, schema.TABLES[table], map(statistics.seen, groups))
+    delta = delta or DeltaTable.create(str(folder), definition)
     delta.create_write_transaction(
-        [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, _statistics(groups))],
+        [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
         "append",
         definition,
         commit_properties=CommitProperties(app_transactions=[Transaction(_APPLICATION, iteration)]),
@@ -190,19 +200,26 @@ def _commit(run: Run, table: str, iteration: int, groups: list[pa.Table]) -> Non
         durable.sync(parent)
 
 
-def _statistics(groups: list[pa.Table]) -> str:
-    """What Delta readers need to skip the file: its number of rows and the range of its identities."""
-    table = pa.concat_tables(groups)
-    ranges = {
-        name: pc.min_max(table.column(name)).as_py()
-        for name in ("iteration", "episode_id")
-        if name in table.column_names and table.num_rows
-    }
-    return json.dumps(
-        {
-            "numRecords": table.num_rows,
-            "minValues": {name: ends["min"] for name, ends in ranges.items()},
-            "maxValues": {name: ends["max"] for name, ends in ranges.items()},
-            "nullCount": {},
-        }
-    )
+class _Statistics:
+    """What Delta readers need to skip a file: its number of rows and the range of its identities."""
+
+    def __init__(self) -> None:
+        self._rows_n = 0
+        self._least: dict[str, int] = {}
+        self._most: dict[str, int] = {}
+
+    def seen(self, group: pa.Table) -> pa.Table:
+        """Count the rows of a row group, and hand it on."""
+        self._rows_n += group.num_rows
+        for name in {"iteration", "episode_id"}.intersection(group.column_names) if group.num_rows else ():
+            ends = pc.min_max(group.column(name)).as_py()
+            self._least[name] = min(ends["min"], self._least.get(name, ends["min"]))
+            self._most[name] = max(ends["max"], self._most.get(name, ends["max"]))
+        return group
+
+    def to_json(self) -> str:
+        """As the Delta protocol has it."""
+        return json.dumps(
+            {"numRecords": self._rows_n, "minValues": self._least, "maxValues": self._most, "nullCount": {}},
+            sort_keys=True,
+        )

@@ -3,7 +3,7 @@
 Each takes a job and gives a tally. `pool_peers` has the libraries.
 
     raw       every process runs the next episode of the plan and forgets it: no Ray, nothing sent, nothing kept
-    service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk; the learner waits for it
+    service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk, learner at work on what came
     pipes     a process gets a plan through a pipe and sends the checked episode back; the parent forces it to the spool
 """
 
@@ -14,7 +14,7 @@ import os
 import tempfile
 import time
 from collections.abc import Iterator
-from contextlib import closing, contextmanager
+from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
@@ -24,16 +24,21 @@ from typing import Any
 from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import NotingWorker, Tally, steps_of
 from t6gps.service.config import Config
+from t6gps.service.execution.executor import Ending
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool import control
 from t6gps.service.pool.attempt import Failure, attempt
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
-from t6gps.storage.records import EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import Spool
 from t6gps.workers.settings import RolloutSettings
 
 START_DEADLINE_S = 180.0
+
+
+class Enough(Exception):
+    """Ends a call of `Executor.sample` early."""
 
 
 @dataclass(frozen=True)
@@ -152,13 +157,18 @@ def service(job: Job) -> tuple[Tally, dict[str, float]]:
         tempfile.TemporaryDirectory() as notes,
         opened(job.config, make_worker=partial(NotingWorker, folder=Path(notes))) as (executor, spool),
     ):
-        for episode in executor.sample(job.plans, job.snapshot):
+
+        def keep(episode: Episode) -> None:
             with clock.of("committer"):
                 spool.append(episode)
             if tally.add(steps_of(episode)):
-                break
+                raise Enough
+            executor.feed(episode)
             if len(tally.done) == 1:
                 clock.start()
+
+        with suppress(Enough):
+            executor.sample(job.plans, job.snapshot, keep)
         spent_s = clock.spent_s()
         tally.read(Path(notes).iterdir())
     return tally, spent_s
@@ -170,11 +180,11 @@ def opened(config: Config, **options: Any) -> Iterator[tuple[RayExecutor, Spool]
     with tempfile.TemporaryDirectory() as folder:
         run = catalog.create(Path(folder), "bench", config.to_json())
         with closing(RayExecutor(config, run, **options)) as executor:
-            executor.ask("policy")  # the learner is ready
+            executor.learner.policy()  # it is ready
             deadline_s = time.monotonic() + START_DEADLINE_S
             while executor.pool.state != "RUNNING":
                 if time.monotonic() > deadline_s:
                     raise RunError(f"the workers did not start within {START_DEADLINE_S:.0f} s: {executor.pool.reason}")
                 executor.pool.tick(control.TICK_S)
-            executor.finished = True
             yield executor, Spool(run.spool, 0)
+            executor.close(Ending.DONE)

@@ -1,6 +1,6 @@
 """A simulated large pool: what supervisor, ledger and committer cost per episode with 10, 100, 1000 workers.
 
-Supervisor, ledger, spool and the lines between are the real ones, and so are the tables' sizes. A worker is only a
+Supervisor, ledger, spool and Ray's object store are the real ones, and so are the tables' sizes. A worker is only a
 slot in one of a few actor processes, which sleeps and then sends an episode of random numbers: a thousand processes
 with an interpreter each would need some 80 GB.
 """
@@ -9,7 +9,6 @@ from __future__ import annotations
 
 import asyncio
 import os
-import pickle
 import socket
 import tempfile
 import time
@@ -23,20 +22,20 @@ import pyarrow as pa
 import ray
 
 from t6gps.service import seeding
-from t6gps.service.bench.contenders import Job
+from t6gps.service.bench.contenders import Enough, Job
 from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import Tally, steps_of
 from t6gps.service.config import Config
 from t6gps.service.pool.control import Control
+from t6gps.service.pool.deadlines import TIMINGS
 from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.supervisor import Pool
 from t6gps.service.pool.transport import Identity
-from t6gps.service.ray_backend import channel
-from t6gps.service.ray_backend.channel import LENGTHS, Address, Hub
 from t6gps.service.ray_backend.cluster import join_or_start, this_node
-from t6gps.service.ray_backend.transport import Answer, Greeting, RayTransport, Remote
+from t6gps.service.ray_backend.transport import Call, RayTransport, Remote
+from t6gps.service.ray_backend.worker_actor import Answer, Greeting
 from t6gps.storage import ipc
-from t6gps.storage.records import EpisodePlan
+from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.storage.spool import Spool
 from t6gps.workers import stub
 
@@ -45,7 +44,7 @@ EPISODE_S = 1.0
 NOTE = (
     f"pool_N_*: N simulated workers are slots of {PROCESSES_N} real Ray actors with {CPUS_PER_PROCESS} CPUs each; "
     f"a slot sleeps {EPISODE_S:g} s per episode, nothing is simulated, pulled or checked in it; "
-    "supervisor, ledger, committer and the lines between are real"
+    "supervisor, ledger, committer and Ray's object store are real"
 )
 
 
@@ -54,25 +53,21 @@ class SlotsActor:
 
     def __init__(self, job: Job) -> None:
         self._whole = stub.episode(job.plans[0], job.snapshot)
-        self._greeting = Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
+        self._turns: dict[int, asyncio.Lock] = {}
 
-    async def work(self, address: Address) -> None:
-        """As WorkerActor.work: sleep for each plan, then send the same numbers under its number."""
-        reader, writer = await asyncio.open_connection(address.host, address.port)
-        writer.write(address.introduction + channel.headed(self._greeting, channel.NOTHING))
-        with suppress(EOFError, OSError):  # until the line is cut
-            while True:
-                head_n, _ = LENGTHS.unpack(await reader.readexactly(LENGTHS.size))
-                plan = pickle.loads(await reader.readexactly(head_n))
-                if plan is None:
-                    writer.write(channel.headed(None, channel.NOTHING))
-                elif isinstance(plan, EpisodePlan):  # nothing is pulled here
-                    await asyncio.sleep(EPISODE_S)
-                    packed = ipc.pack(
-                        *(_renumbered(table, plan) for table in (self._whole.frames, self._whole.summary))
-                    )
-                    writer.writelines((channel.headed(Answer(plan), packed), packed))
-                    await writer.drain()
+    async def open(self, slot: int) -> Greeting:
+        """Make a slot; as WorkerActor.open, but with no process to end with it."""
+        self._turns[slot] = asyncio.Lock()
+        return Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
+
+    async def ping(self) -> None:
+        """A sign of life."""
+
+    async def run(self, slot: int, plan: EpisodePlan) -> Answer:
+        """Sleep, when the slot's last plan is done; then send the same numbers under the plan's number."""
+        async with self._turns[slot]:
+            await asyncio.sleep(EPISODE_S)
+        return Answer(ipc.pack(*(_renumbered(table, plan) for table in (self._whole.frames, self._whole.summary))))
 
 
 def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
@@ -81,18 +76,34 @@ def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
     return table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type))
 
 
+class _Slot(Remote):
+    def __init__(self, actor: Any, number: int) -> None:
+        super().__init__(actor)
+        self.number = number
+
+
 class SlotsTransport(RayTransport):
     """Workers as slots of a few actors."""
 
-    def __init__(self, hub: Hub, job: Job, slots_n: int) -> None:
-        super().__init__(hub, _no_worker, job.config.rollout, CPUS_PER_PROCESS)
+    def __init__(self, job: Job, slots_n: int) -> None:
+        super().__init__(_no_worker, job.config.rollout, CPUS_PER_PROCESS, TIMINGS)
         plain: Any = SlotsActor
-        made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=slots_n)
+        made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=4 * slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
 
     def start(self, slot: int, incarnation: int) -> Remote:
-        address, actor = self._hub.open(), self._actors[slot % PROCESSES_N]
-        return self._started(Remote(actor, address.number), actor.work.remote(address))
+        remote = _Slot(self._actors[slot % PROCESSES_N], slot)
+        self._await(Call(remote, remote.actor.open.remote(slot)))
+        return remote
+
+    def send(self, handle: Remote, plan: EpisodePlan) -> None:
+        assert isinstance(handle, _Slot)
+        self._await(Call(handle, handle.actor.run.remote(handle.number, plan), plan))
+
+    def close(self) -> None:
+        """End the actors."""
+        for actor in self._actors:
+            ray.kill(actor)
 
 
 def _no_worker(_: object) -> Any:
@@ -145,8 +156,7 @@ def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, fl
 def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
     plans = seeding.training_plans(_with_episodes(job.config, round(3 * workers_n * (seconds / EPISODE_S + 2))), 0)
     ledger, clock, tally = _TimedLedger(), RoleClock(), Tally(seconds)
-    hub = Hub("127.0.0.1")
-    transport = SlotsTransport(hub, job, workers_n)
+    transport = SlotsTransport(job, workers_n)
     pool = Pool(transport, ledger, workers_n, "", Control(None, workers_n), lambda _: None)
     with tempfile.TemporaryDirectory() as folder:
         spool = Spool(Path(folder), 0)
@@ -155,21 +165,24 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
         ledger.open(plans)
         pool.open({})
         wait_s = main_s = 0.0
-        for episode in pool.arrivals():
+
+        def keep(episode: Episode) -> None:
+            nonlocal wait_s, main_s
             begin_s, busy_s = time.monotonic(), time.thread_time()
             with clock.of("committer"):
                 spool.append(episode)
             wait_s += time.monotonic() - begin_s - (time.thread_time() - busy_s)
             if tally.add(steps_of(episode)):
-                break
+                raise Enough
             if len(tally.done) == 1:  # from here on it is counted
                 clock.start()
                 ledger.spent_s, wait_s, main_s = 0.0, 0.0, time.thread_time()
+
+        with suppress(Enough):
+            pool.sample(keep)
         main_s = time.thread_time() - main_s
         spent_s = clock.spent_s()
-    for actor in transport._actors:
-        ray.kill(actor)
-    hub.close()
+    transport.close()
     episodes_n = len(tally.done) - 1
     took_s = tally.done[-1][0] - tally.done[0][0]
     own_s = spent_s["supervisor"] + spent_s["committer"]

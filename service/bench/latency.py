@@ -10,6 +10,7 @@ import os
 import signal
 import tempfile
 import time
+from contextlib import suppress
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from t6gps.service import seeding
-from t6gps.service.bench.contenders import Job, opened
+from t6gps.service.bench.contenders import Enough, Job, opened
 from t6gps.service.pool.workers import Worker
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -56,8 +57,7 @@ def weight_latencies(job: Job, versions_n: int) -> list[float]:
             for version in range(versions_n):
                 plans = seeding.training_plans(config, version)
                 begin_s = time.monotonic()
-                for _ in executor.sample(plans, replace(job.snapshot, version=version)):
-                    pass
+                executor.sample(plans, replace(job.snapshot, version=version), lambda _: None)
                 stamps = [float(path.read_text()) for path in folder.glob(f"{version}-*")]
                 latencies += [stamp - begin_s for stamp in stamps]
     return latencies
@@ -74,20 +74,25 @@ def recoveries(job: Job, faults: dict[signal.Signals, int]) -> dict[signal.Signa
     hit: Worker | None = None
     hit_s, calm_n = 0.0, job.workers  # once all have sent an episode, the deadlines are measured
     with opened(job.config) as (executor, spool):
-        for episode in executor.sample(job.plans, job.snapshot):
-            lease = executor.ledger.lease_of(episode.summary["episode_id"][0].as_py())
+
+        def keep(episode: Episode) -> None:
+            nonlocal hit, hit_s, calm_n
+            lease = executor.ledger.lease_of(episode.episode_id)
             if hit and lease and lease.slot == hit.slot and lease.incarnation > hit.incarnation:
                 took_s[due.pop(0)].append(time.monotonic() - hit_s)
                 hit, calm_n = None, int(rng.integers(*BETWEEN_FAULTS))
             spool.append(episode)
             calm_n -= 1
             if not due:
-                break
+                raise Enough
             at_work = [worker for worker in executor.pool.workers.values() if worker.phase == "sampling"]
             if hit is None and calm_n <= 0 and at_work:
                 hit, hit_s = at_work[rng.integers(len(at_work))], time.monotonic()
                 assert hit.identity is not None  # it is at work
                 os.kill(hit.identity.pid, due[0])
+
+        with suppress(Enough):
+            executor.sample(job.plans, job.snapshot, keep)
     if due:
         raise RunError(f"the episodes ended before {len(due)} workers had recovered; measure for longer")
     return took_s

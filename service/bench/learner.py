@@ -13,9 +13,9 @@ from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.execution.executor import PHASES, Executor
 from t6gps.service.execution.ray_executor import RayExecutor
-from t6gps.service.execution.serial import new_learner
+from t6gps.service.execution.wiring import new_learner
 from t6gps.service.views import terminal
-from t6gps.storage.records import EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 
 UNTRAINED_EPISODES = 60
 THREADS = os.cpu_count()
@@ -44,9 +44,12 @@ def learner() -> dict[str, float]:
 
 def _sampled(executor: Executor, plans: Sequence[EpisodePlan], policy: PolicySnapshot) -> list[pa.Table]:
     """Frames of the episodes, in the order of their plans."""
-    found = {}
+    found: dict[int, pa.Table] = {}
     with terminal.task(f"sampling {len(plans)} episodes") as progress:
-        for episode in executor.sample(plans, policy):
+
+        def keep(episode: Episode) -> None:
             found[episode.summary["index"][0].as_py()] = episode.frames
             progress(len(found), len(plans))
+
+        executor.sample(plans, policy, keep)
     return [found[index] for index in sorted(found)]

@@ -19,7 +19,7 @@ from t6gps.service import seeding
 from t6gps.service.bench import large_pool, latency
 from t6gps.service.bench.contenders import Job, pipes, raw, service
 from t6gps.service.bench.tally import Tally
-from t6gps.service.execution.serial import new_learner
+from t6gps.service.execution.wiring import new_learner
 from t6gps.service.views.terminal import console
 from t6gps.storage.errors import ConfigError
 

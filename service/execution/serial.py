@@ -1,30 +1,26 @@
-"""One worker and the learner in this process, and how both are made from a configuration."""
+"""One worker and the learner in this process: for debugging, tests and `--serial`."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
-from typing import Any
 
 from t6gps.learner.learner import Learner
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Executor
+from t6gps.service.execution.executor import Ending, Executor, Keep, Purpose
+from t6gps.service.execution.wiring import new_learner
 from t6gps.service.pool.attempt import Failure, attempt
 from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation, nominal_rest_length
-from t6gps.workers.robot.symmetry import CABLE_MAP, PROPER
+from t6gps.workers.physics.simulation import Simulation
 from t6gps.workers.settings import RobotSettings
 from t6gps.workers.worker import RolloutWorker
 
-ACTION_SCALE_M = 0.2
-"""Rest length per unit of the policy's output (m)."""
-
 
 class SerialExecutor(Executor):
-    """One worker and the learner in this process: for debugging, tests and `--serial`."""
+    """One worker and the learner, which take turns."""
 
     def __init__(
         self,
@@ -36,9 +32,17 @@ class SerialExecutor(Executor):
         self._worker = RolloutWorker(config.rollout, simulation)
         self.replace_learner()
 
+    @property
+    def learner(self) -> Learner:
+        return self._learner
+
     def sample(
-        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: str = "episode"
-    ) -> Iterator[Episode]:
+        self,
+        plans: Sequence[EpisodePlan],
+        snapshot: PolicySnapshot,
+        keep: Keep,
+        purpose: Purpose = Purpose.TRAINING,
+    ) -> None:
         self._open(plans, snapshot, purpose)
         while (plan := self.ledger.lease(0, 0)) is not None:
             result = attempt(self._worker, plan, snapshot)
@@ -49,45 +53,24 @@ class SerialExecutor(Executor):
                     raise RunError(f"nothing but failures comes back; the last: episode {plan.episode_id}: {result}")
                 continue
             self.ledger.arrive(plan)
-            yield result
+            keep(result)
             self.ledger.commit(plan.episode_id)
 
-    def sample_ahead(
-        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
-    ) -> None:
+    def sample_ahead(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Keep) -> None:
         """Nothing runs beside the learner here: all plans are left to `sample`."""
 
-    def hand_over(self, kept: Sequence[Path]) -> None:
-        for path in kept:
-            self._learner.add(spool.read(path).frames)
+    def feed(self, episode: Episode) -> None:
+        self._learner.add(episode.frames)
+
+    def feed_spooled(self, files: Sequence[Path]) -> None:
+        for file in files:
+            self._learner.add(spool.read(file).frames)
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         yield from getattr(self._learner, phase)()
 
-    def ask(self, method: str, *arguments: Any) -> Any:
-        return getattr(self._learner, method)(*arguments)
-
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)
 
-    def close(self) -> None:
+    def close(self, ending: Ending = Ending.STOPPED) -> None:
         self._worker.close()
-
-
-def new_learner(config: Config, **options: Any) -> Learner:
-    """The learner of a run, with its first policy."""
-    robot = config.robot
-    return Learner(
-        config.learner,
-        run_seed=config.run.seed,
-        target_speed_m_per_s=config.task.target_speed_m_per_s,
-        vertical_weight=config.task.vertical_weight,
-        command_range_m=(robot.shortest_command_m, robot.longest_command_m),
-        offset_m=nominal_rest_length(robot),
-        scale_m=ACTION_SCALE_M,
-        reach_m=robot.winch_speed_m_per_s * CONTROL_STEP_S,
-        world_labels=CABLE_MAP,
-        mirrored=~PROPER,
-        keeps_earlier=config.run.pipelined,
-        **options,
-    )

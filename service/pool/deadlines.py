@@ -1,22 +1,52 @@
-"""How long an episode may take, from how long others took."""
+"""How long the pool waits for what; for an episode, by how long others took."""
 
 from __future__ import annotations
 
 from collections import deque
+from dataclasses import dataclass
 
 REMEMBERED_N = 200
 QUANTILE = 0.95
 FACTOR = 12.0
 """A worker ten times slower than the others is slow; it does not hang."""
-SHORTEST_S = 5.0
 FIRST_S, FIRST_PER_STEP_S = 60.0, 0.1
 """While nothing is measured: a minute, and the time that the robot itself would take."""
+
+
+@dataclass(frozen=True, kw_only=True)
+class Timings:
+    """How long the pool waits (s)."""
+
+    shortest_episode_s: float = 5.0
+    """No episode has a shorter deadline."""
+    start_s: float = 180.0
+    """For a worker's process to be ready, once there is room for it."""
+    pending_after_s: float = 3.0
+    """A process needs so long to start, also where there is room for it."""
+    ping_s: float = 1.0
+    """Between two questions for a sign of life, to an idle worker or to the policy server."""
+    ping_deadline_s: float = 20.0
+    """For an idle worker's answer."""
+    capacity_s: float = 1.0
+    """Between two questions for room in the cluster, while somebody needs it."""
+    shrink_after_s: float = 30.0
+    """Autoscaling gives a worker up after it was not needed for so long: the learner's phases are shorter."""
+    policy_answer_s: float = 4.0
+    """For the policy server's answer. An episode has more time than that: a worker that asks is not to blame."""
+    policy_start_s: float = 60.0
+    """For the first answer of a policy server, whose process has to start."""
+    examine_s: float = 0.6
+    """For another node to say what is left of a worker; it is cut off, and its node with it, when it does not."""
+
+
+TIMINGS = Timings()
 
 
 class EpisodeTimes:
     """Times of recent episodes, per control step."""
 
-    def __init__(self) -> None:
+    def __init__(self, shortest_s: float) -> None:
+        self._shortest_s = shortest_s
         self._per_step_s: deque[float] = deque(maxlen=REMEMBERED_N)
 
     def add(self, took_s: float, steps: int) -> None:
@@ -28,4 +58,4 @@ class EpisodeTimes:
         if not self._per_step_s:
             return FIRST_S + FIRST_PER_STEP_S * steps
         ordered = sorted(self._per_step_s)
-        return max(SHORTEST_S, FACTOR * ordered[int(QUANTILE * (len(ordered) - 1))] * steps)
+        return max(self._shortest_s, FACTOR * ordered[int(QUANTILE * (len(ordered) - 1))] * steps)

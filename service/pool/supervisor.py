@@ -11,13 +11,13 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 from t6gps.service.pool import control
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.control import Control
-from t6gps.service.pool.deadlines import EpisodeTimes
+from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes, Timings
 from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.transport import Alive, Died, Done, Handle, Identity, Ready, Report, Transport
 from t6gps.service.pool.workers import Slot, Worker
@@ -29,14 +29,6 @@ BYTES_IN_FLIGHT = 2**30
 """Episodes under way count with the size of the largest seen."""
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
-START_DEADLINE_S = 180.0
-PENDING_AFTER_S = 3.0
-"""A process needs so long to start, also where there is room for it."""
-PING_S, PING_DEADLINE_S = 1.0, 20.0
-CAPACITY_S = 1.0
-"""How often the cluster is asked for room while somebody needs it."""
-SHRINK_AFTER_S = 30.0
-"""Autoscaling gives a worker up after it was not needed for so long: the learner's phases are shorter."""
 
 
 class Pool:
@@ -58,6 +50,7 @@ class Pool:
         quarantine: Callable[[EpisodePlan], None],
         clock: Callable[[], float] = time.monotonic,
         autoscale: tuple[int, int] | None = None,
+        timings: Timings = TIMINGS,
     ) -> None:
         self.ledger = ledger
         self.wanted = wanted
@@ -75,7 +68,8 @@ class Pool:
         self._autoscale = autoscale
         self._by_handle: dict[Handle, Worker] = {}
         self._slots: dict[int, Slot] = {}
-        self._times = EpisodeTimes()
+        self._times = EpisodeTimes(timings.shortest_episode_s)
+        self._timings = timings
         self._arrived: deque[tuple[int, Episode]] = deque()
         self._largest_bytes = 1
         self._failed_starts_n = 0
@@ -113,23 +107,19 @@ class Pool:
         self._arrived.clear()
         self.phase = "sampling"
 
-    def arrivals(self) -> Iterator[Episode]:
-        """New episodes of the ledger's book until none is missing.
-
-        Going on past one says that it is durable.
-        """
-        while self._arrived or self.ledger.backlog:
-            if not self._arrived:
-                self.tick(control.TICK_S)
-            yield from self.arrived()
+    def sample(self, keep: Callable[[Episode], None]) -> None:
+        """Let the workers run the batch until no episode is missing; see `deliver` for `keep`."""
+        while self.ledger.backlog:
+            self.tick(0.0 if self._arrived else control.TICK_S)
+            self.deliver(keep)
         if self.ledger.hopeless:
             self.tick()
 
-    def arrived(self) -> Iterator[Episode]:
-        """Those of them that are there, without waiting for others."""
+    def deliver(self, keep: Callable[[Episode], None]) -> None:
+        """Hand over the episodes that are there; when `keep` returns, one is durable."""
         while self._arrived:
             episode_id, episode = self._arrived.popleft()
-            yield episode
+            keep(episode)
             self.ledger.commit(episode_id)
 
     def close(self, state: str, reason: str) -> None:
@@ -232,11 +222,11 @@ class Pool:
             for_s, silent_s = now - worker.since_s, now - max(worker.pinged_s, worker.since_s)
             if now > worker.deadline_s:
                 self._end(worker, now, "hang", "Hang", f"no result within {for_s:.1f} s")
-            elif worker.phase == "starting" and for_s > START_DEADLINE_S and not self._pending(worker):
+            elif worker.phase == "starting" and for_s > self._timings.start_s and not self._pending(worker):
                 self._end(worker, now, "hang", "Hang", f"not ready {for_s:.1f} s after its start")
-            elif worker.phase == "idle" and not worker.answered and silent_s > PING_DEADLINE_S:
+            elif worker.phase == "idle" and not worker.answered and silent_s > self._timings.ping_deadline_s:
                 self._end(worker, now, "hang", "Hang", f"no sign of life for {silent_s:.1f} s")
-            elif worker.phase == "idle" and worker.answered and silent_s > PING_S:
+            elif worker.phase == "idle" and worker.answered and silent_s > self._timings.ping_s:
                 self._transport.ping(worker.handle)
                 worker.pinged_s, worker.answered = now, False
 
@@ -246,10 +236,11 @@ class Pool:
 
     def _scale(self, now: float) -> None:
         starting = [worker for worker in self.workers.values() if worker.phase == "starting"]
-        if (starting or self._autoscale) and now - self._asked_s >= CAPACITY_S:
+        if (starting or self._autoscale) and now - self._asked_s >= self._timings.capacity_s:
             self._free_n, self._asked_s = self._transport.free_workers(), now
             for worker in starting:
-                worker.placed = now - worker.since_s < PENDING_AFTER_S or self._transport.placed(worker.handle)
+                fresh = now - worker.since_s < self._timings.pending_after_s
+                worker.placed = fresh or self._transport.placed(worker.handle)
         wish = self._control.wish()
         if wish is not None:
             self.wanted, self._autoscale = wish, None  # scaled by hand: it stays so
@@ -260,7 +251,7 @@ class Pool:
         useful = min(most, max(least, min(room, math.ceil(self.ledger.backlog / PLANS_PER_WORKER))))
         if useful >= self.wanted:
             self.wanted, self._needed_s = useful, now
-        elif now - self._needed_s > SHRINK_AFTER_S:
+        elif now - self._needed_s > self._timings.shrink_after_s:
             self.wanted = useful
 
     def _drain(self, now: float) -> None:

@@ -1,6 +1,6 @@
 """Joining a cluster of Ray, or starting one on this machine, and where in it what runs.
 
-Whatever the run cannot go on without - the learner, the weights - runs on the node of the supervising process: it is
+Whatever the run cannot do without - the learner, the policy server - runs on the node of the supervising process: it is
 lost with that node alone. Workers are spread over all nodes.
 """
 
@@ -13,19 +13,16 @@ import socket
 from typing import Any
 
 import ray
-from ray._private import services
-from ray._private import worker as ray_worker
-from ray._private.state import available_resources_per_node
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from t6gps.service.config import WORKERS_MOST_N, Config
+from t6gps.service.ray_backend import private
 from t6gps.storage.errors import RunError
 
 OBJECT_STORE_BYTES = 2 * 1024**3
 CONNECT_DEADLINE_S = 10.0
 """How long the head of a cluster has to answer."""
 SPREAD = "SPREAD"
-_log = logging.getLogger(__name__)
 
 
 def join_or_start(config: Config) -> int:
@@ -33,9 +30,7 @@ def join_or_start(config: Config) -> int:
 
     RunError when that fails.
     """
-    ray_worker.print_to_stdstream = _to_log
-    # A loopback address would be replaced by that of the host: ports opened to its network, a cluster not found.
-    services.resolve_ip_for_localhost = _as_given
+    private.prepare_start()
     if "RAY_ADDRESS" in os.environ:
         _join(os.environ["RAY_ADDRESS"])
         return WORKERS_MOST_N  # nodes may join later
@@ -51,9 +46,6 @@ def join_or_start(config: Config) -> int:
         object_store_memory=OBJECT_STORE_BYTES,
         _node_ip_address="127.0.0.1",
     )
-    node: Any = ray_worker._global_node
-    for unused in (node.kill_log_monitor, node.kill_monitor, node.kill_dashboard):  # logs to forward, nodes to start
-        unused(check_alive=False)
     return int(cpus_n / each + 1e-6)
 
 
@@ -74,8 +66,7 @@ def this_node() -> str:
 
 def free_workers(cpus_per_worker: float) -> int:
     """So many more workers find room: what is left on one node is of no use to a worker on another."""
-    nodes: dict[str, dict[str, float]] = available_resources_per_node()  # type: ignore[no-untyped-call]
-    return sum(int(free.get("CPU", 0.0) / cpus_per_worker + 1e-6) for free in nodes.values())
+    return sum(int(free / cpus_per_worker + 1e-6) for free in private.free_cpus_by_node())
 
 
 def _join(address: str) -> None:
@@ -104,12 +95,3 @@ def _init(trouble: str, remedy: str, **options: Any) -> None:
     except Exception as error:  # Ray has no narrower one for this
         ray.shutdown()
         raise RunError(f"{trouble}: {' '.join(str(error).split())}; {remedy}") from error
-
-
-def _as_given(host: str) -> str:
-    return host
-
-
-def _to_log(data: dict[str, Any], ignore_prefix: bool) -> None:
-    """What Ray would print among the results on stdout, such as the death of a worker that the pool replaces."""
-    _log.info("ray: %s", " ".join(data["lines"]))

@@ -11,10 +11,11 @@ import pyarrow as pa
 
 from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Executor
+from t6gps.service.execution.executor import Executor, Purpose
 from t6gps.service.training.loop import Observer, mean_and_error
 from t6gps.storage import durable
 from t6gps.storage.catalog import Run
+from t6gps.storage.records import Episode
 
 EVALUATED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
@@ -33,12 +34,17 @@ def evaluate(
     config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None, observer: Observer
 ) -> Evaluation:
     """Run the learner's policy in `episodes` noise-free episodes."""
-    snapshot = executor.ask("policy")
+    snapshot = executor.learner.policy()
     plans = seeding.evaluation_plans(config, episodes, seed, terrain_seed, snapshot.version)
-    summaries = {}
-    for episode in executor.sample(plans, snapshot, "evaluation"):
-        summaries[episode.summary["index"][0].as_py()] = episode.summary
+    summaries: dict[int, pa.Table] = {}
+
+    def keep(episode: Episode) -> None:
+        summaries[episode.summary["index"][0].as_py()] = episode.summary.take(
+            [0]
+        )  # a copy: the episode's memory is not held
         observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
+
+    executor.sample(plans, snapshot, keep, Purpose.EVALUATION)
     return summarise([summaries[index] for index in sorted(summaries)], seed)
 
 

@@ -72,8 +72,8 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
             latest = checkpoint.load_latest(run.checkpoints)
             if latest is not None:
                 first, manifest, arrays = latest
-                executor.ask("restore", manifest, arrays)
-                executor.ask("recall", run)
+                executor.learner.restore(manifest, arrays)
+                executor.learner.recall(run)
                 if not resumed:
                     executor.ledger.restore(manifest.get("ledger"))
             resumed = True
@@ -103,7 +103,7 @@ class Batch:
 
 def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
     plans = seeding.training_plans(config, spool.iteration)
-    snapshot = executor.ask("policy", plans[0].policy_version)
+    snapshot = executor.learner.policy(plans[0].policy_version)
     return Batch(plans, set(spool.episodes()), snapshot)
 
 
@@ -113,14 +113,17 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         spool = Spool(run.spool, iteration)
         batch = _batch(config, executor, spool)
         plans, kept = batch.plans, batch.kept
-        arriving = executor.sample(batch.missing, batch.snapshot)
-        observer.progress(iteration, "sample", len(kept), len(plans))
-        for episode in arriving:
+
+        def keep(episode: Episode) -> None:
             spool.append(episode)
-            kept.add(episode.summary["episode_id"][0].as_py())
+            kept.add(episode.episode_id)
+            executor.feed(episode)
             observer.progress(iteration, "sample", len(kept), len(plans))
+
+        observer.progress(iteration, "sample", len(kept), len(plans))
+        executor.feed_spooled([spool.path(number) for number in sorted(kept)])
+        executor.sample(batch.missing, batch.snapshot, keep)
         files = [spool.path(number) for number in sorted(kept)]
-        executor.hand_over(files)
     if not kept:
         raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
     if config.run.pipelined and iteration + 1 < config.run.iterations:
@@ -129,13 +132,13 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         with _timed(durations, phase):
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase, done, total)
-    learned, classes = executor.ask("report")
-    episodes = [read(path) for path in files]
+    learned, classes = executor.learner.report()
+    summaries = pa.concat_tables([read(path).summary for path in files]).combine_chunks()
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
-    row |= _sampled(episodes) | learned | durations
-    row["left_out"] = len(plans) - len(episodes)
-    tables.commit_iteration(run, iteration, episodes, row, classes)
-    manifest, arrays = executor.ask("state")
+    row |= _sampled(summaries) | learned | durations
+    row["left_out"] = len(plans) - len(files)
+    tables.commit_iteration(run, iteration, map(read, files), row, classes)
+    manifest, arrays = executor.learner.state()
     checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
     spool.clear()
     observer.finished(row)
@@ -154,10 +157,9 @@ def _timed(durations: dict[str, float], phase: str) -> Iterator[None]:
     durations[DURATION_COLUMNS[phase]] = time.perf_counter() - start
 
 
-def _sampled(episodes: list[Episode]) -> dict[str, Any]:
-    """The part of an iteration's row that describes its episodes."""
-    summary = pa.concat_tables([episode.summary for episode in episodes])
-    result: dict[str, Any] = {"episodes": len(episodes), "steps": int(np.sum(summary["steps"].to_numpy()))}
+def _sampled(summary: pa.Table) -> dict[str, Any]:
+    """The part of an iteration's row that describes its episodes, from their summaries."""
+    result: dict[str, Any] = {"episodes": summary.num_rows, "steps": int(np.sum(summary["steps"].to_numpy()))}
     for column, error in (
         ("cost", "cost_standard_error"),
         ("forward_speed_m_per_s", "forward_speed_standard_error"),

@@ -1,8 +1,8 @@
-"""An executor with stub workers that obey orders, and the policy and plans of one book after another."""
+"""An executor with stub workers that obey orders, and the policy and plans of one batch after another."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -17,14 +17,17 @@ from ray.cluster_utils import Cluster
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
+from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.workers import Worker
 from t6gps.service.ray_backend import cluster
 from t6gps.storage import catalog, schema
-from t6gps.storage.records import Episode, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import stub
 from t6gps.workers.stub import StubWorker
 
 EPISODE_S, RUN = 0.1, "faults"
+QUICK = Timings(shortest_episode_s=2.0, policy_answer_s=1.5)
+"""Hangs are found after 2 s: the episodes take a tenth of a second."""
 CONFIG = {"run": {"episodes": 30, "steps": 20, "workers": 2, "cpus_per_worker": 0.5}}
 
 QUICK_HEALTH_CHECKS = {
@@ -73,30 +76,43 @@ def others(nodes: Cluster) -> dict[str, Any]:
 
 
 class House:
-    """An executor with stub workers, its orders, and one book after another."""
+    """An executor with stub workers, its orders, and one batch after another."""
 
-    def __init__(self, root: Path, config: dict[str, Any] | None = None) -> None:
+    def __init__(self, root: Path, config: dict[str, Any] | None = None, timings: Timings = QUICK) -> None:
         self.config = Config.model_validate(config or CONFIG)
         self.run = catalog.create(root, RUN, self.config.to_json())
         self.orders = root / "orders"
         self.orders.mkdir()
         make = partial(StubWorker, episode_s=EPISODE_S, orders=self.orders)
-        self.executor = RayExecutor(self.config, self.run, make)
+        self.executor = RayExecutor(self.config, self.run, make, timings)
         self.iteration = -1
 
     def order(self, episode: int, what: str) -> int:
-        """Order a fault for an episode of the next book."""
+        """Order a fault for an episode of the next batch."""
         number = (self.iteration + 1) * self.config.run.episodes + episode
         (self.orders / f"episode-{number}").write_text(what)
         return number
 
-    def sample(self) -> Iterator[Episode]:
-        """A new book, with a policy of its own."""
+    def sample(self, after_each: Callable[[list[Episode]], None] = lambda _: None) -> list[Episode]:
+        """A new batch, with a policy of its own; `after_each` sees the episodes that there are so far."""
         self.iteration += 1
-        yield from self.executor.sample(self.plans, policy(self.iteration))
+        return self.sample_again(self.plans, after_each)
+
+    def sample_again(
+        self, plans: list[EpisodePlan], after_each: Callable[[list[Episode]], None] = lambda _: None
+    ) -> list[Episode]:
+        """Plans of the same batch."""
+        found: list[Episode] = []
+
+        def keep(episode: Episode) -> None:
+            found.append(episode)
+            after_each(found)
+
+        self.executor.sample(plans, policy(self.iteration), keep)
+        return found
 
     @property
-    def plans(self) -> list[Any]:
+    def plans(self) -> list[EpisodePlan]:
         return seeding.training_plans(self.config, self.iteration)
 
     @property
@@ -111,7 +127,7 @@ class House:
 
     def check(self, found: list[Episode], without: tuple[int, ...] = ()) -> None:
         """Every planned episode is there once, and it is what the plan alone makes of it."""
-        numbers = [episode.summary["episode_id"][0].as_py() for episode in found]
+        numbers = [episode.episode_id for episode in found]
         expected = {plan.episode_id: plan for plan in self.plans if plan.episode_id not in without}
         assert sorted(numbers) == sorted(expected)
         for number, episode in zip(numbers, found, strict=True):

@@ -1,7 +1,7 @@
-"""A run of stub workers in a process of its own: `python job.py ROOT` samples one book after another into its spool.
+"""A run of stub workers in a process of its own: `python job.py ROOT` samples one batch after another into its spool.
 
 It begins with one worker and gets one on every host that joins (autoscaling), tells its status like any run, and ends
-after the book in which ROOT/enough appears.
+after the batch in which ROOT/enough appears.
 """
 
 from __future__ import annotations
@@ -14,6 +14,7 @@ from pathlib import Path
 from house import House, policy
 
 from t6gps.service import seeding
+from t6gps.service.execution.executor import Ending
 from t6gps.storage import catalog
 from t6gps.storage.spool import Spool
 
@@ -25,11 +26,10 @@ def main(root: Path) -> None:
     with catalog.locked(house.run), closing(house.executor) as executor:
         for iteration in count():
             spool = Spool(house.run.spool, iteration)
-            for episode in executor.sample(seeding.training_plans(house.config, iteration), policy(iteration)):
-                spool.append(episode)
+            executor.sample(seeding.training_plans(house.config, iteration), policy(iteration), spool.append)
             if (root / "enough").exists():
                 break
-        executor.finished = True
+        executor.close(Ending.DONE)
 
 
 if __name__ == "__main__":

@@ -9,17 +9,18 @@ import os
 import signal
 import threading
 from collections.abc import Callable, Container, Iterator
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 import ray
-from house import House, add_node, others, pid, three_nodes
+from house import QUICK, House, add_node, others, pid, three_nodes
 from ray.cluster_utils import Cluster
 
-from t6gps.service.pool import control, deadlines
+from t6gps.service.pool import control
 from t6gps.service.pool.workers import Worker
-from t6gps.service.ray_backend import cluster, transport
+from t6gps.service.ray_backend import cluster
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -36,7 +37,7 @@ def nodes() -> Iterator[Cluster]:
 
 @pytest.fixture(scope="module")
 def everything(nodes: Cluster, tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    house = House(tmp_path_factory.mktemp("nodes"), CONFIG)
+    house = House(tmp_path_factory.mktemp("nodes"), CONFIG, replace(QUICK, examine_s=10.0))  # a busy machine
     with catalog.locked(house.run):
         try:
             yield house
@@ -68,24 +69,22 @@ def busy(house: House, names: Container[str]) -> Worker | None:
 
 def test_workers_are_spread_over_all_nodes_and_give_the_same_data(house: House) -> None:
     assert nodes_in_use(house) == {node["NodeID"] for node in ray.nodes()}
-    house.check(list(house.sample()))
+    house.check(house.sample())
     assert cluster.free_workers(CPUS_PER_WORKER) == 0  # 0.4 CPUs are left on each, and no worker fits on any
     assert ray.available_resources()["CPU"] > CPUS_PER_WORKER
 
 
 @pytest.mark.parametrize("how", ["SIGSTOP", "hang-in-c"])
 def test_t2_a_worker_that_hangs_on_another_node_is_looked_into_and_ended_there(
-    house: House, nodes: Cluster, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None], how: str
+    house: House, nodes: Cluster, wait_until: Callable[..., None], how: str
 ) -> None:
-    house.check(list(house.sample()))  # the deadlines are measured now
-    monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
-    monkeypatch.setattr(transport, "EXAMINE_DEADLINE_S", 10.0)  # a busy machine
-    found: list[Episode] = []
+    house.check(house.sample())  # the deadlines are measured now
     process, struck = 0, -1  # and the episode that hangs
-    for episode in house.sample():
-        found.append(episode)
+
+    def strike(found: list[Episode]) -> None:
+        nonlocal process, struck
         victim = busy(house, others(nodes))
-        came = [one.summary["episode_id"][0].as_py() for one in found]
+        came = [episode.episode_id for episode in found]
         missed = how == "hang-in-c" and struck in came and not house.executor.ledger.failures  # it had begun already
         if victim is not None and (struck < 0 or missed):
             process, struck = pid(victim), victim.plans[1].episode_id
@@ -93,7 +92,8 @@ def test_t2_a_worker_that_hangs_on_another_node_is_looked_into_and_ended_there(
                 os.kill(process, signal.SIGSTOP)
             else:
                 (house.orders / f"episode-{struck}").write_text("hang-in-c 1")
-    house.check(found)
+
+    house.check(house.sample(strike))
     ((failure,),) = house.executor.ledger.failures.values()
     assert {"SIGSTOP": "(SIGSTOP)", "hang-in-c": "_hang_in_c"}[how] in failure.trace
     assert failure.kind == {"SIGSTOP": "lost", "hang-in-c": "hang"}[how]
@@ -112,13 +112,13 @@ def test_a_node_that_joins_gets_workers_when_more_are_wished(house: House, nodes
     scaling, before, joined = threading.Thread(target=scale), nodes_in_use(house), False
     scaling.start()
     while scaling.is_alive():
-        house.check(list(house.sample()))
+        house.check(house.sample())
         if not joined and "wait for a CPU" in house.executor.pool.reason:
             add_node(nodes)
             joined = True
     assert answers == [4]
     assert len(nodes_in_use(house)) == len(before) + 1
-    house.check(list(house.sample()))
+    house.check(house.sample())
     house.executor.pool.wanted = 3
 
 
@@ -126,15 +126,17 @@ def test_t16_a_node_that_dies_takes_no_episode_with_it(
     house: House, nodes: Cluster, wait_until: Callable[..., None]
 ) -> None:
     add_node(nodes)  # there is room for a successor
-    failures_n, found, node = house.executor.ledger.counters["failures"], list[Episode](), ""
-    for episode in house.sample():
-        found.append(episode)
+    failures_n, slot, incarnation, node = house.executor.ledger.counters["failures"], 0, 0, ""
+
+    def remove(_: list[Episode]) -> None:
+        nonlocal slot, incarnation, node
         victim = busy(house, others(nodes))
         if victim is not None and not node:
             slot, incarnation, node = victim.slot, victim.incarnation, node_of(victim)
             nodes.remove_node(others(nodes)[node], allow_graceful=False)
-    house.check(found)
+
+    house.check(house.sample(remove))
     assert house.executor.ledger.counters["failures"] == failures_n  # no episode is to blame
     wait_until(lambda: house.ready(3) and node not in nodes_in_use(house), 120)
     assert house.executor.pool.workers[slot].incarnation > incarnation
-    house.check(list(house.sample()))
+    house.check(house.sample())

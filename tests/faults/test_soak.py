@@ -22,10 +22,10 @@ from t6gps.learner import policy
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
-from t6gps.service.pool import deadlines
+from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.workers import Worker
 from t6gps.storage import catalog, durable, schema
-from t6gps.storage.records import EpisodePlan
+from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.stub import StubWorker
 
@@ -44,7 +44,8 @@ class Soak:
     def __init__(self, root: Path) -> None:
         self.config = Config.model_validate(CONFIG)
         self.run = catalog.create(root, "soak", self.config.to_json())
-        self.executor = RayExecutor(self.config, self.run, partial(StubWorker, episode_s=EPISODE_S))
+        make = partial(StubWorker, episode_s=EPISODE_S)
+        self.executor = RayExecutor(self.config, self.run, make, Timings(shortest_episode_s=2.0))
         self.rng = np.random.default_rng(0)
         self.faults = dict.fromkeys(FAULTS, 0)
         self.measured: list[dict[str, float]] = []
@@ -95,9 +96,9 @@ class Soak:
         os.kill(victim.identity.pid, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
 
     def _measure(self, now: float) -> dict[str, float]:
-        holder = self.executor._transport._weights.process
-        assert holder is not None
-        pids = {"driver": os.getpid(), "holder": holder.pid}
+        server = self.executor.transport.policies.process
+        assert server is not None
+        pids = {"driver": os.getpid(), "policy_server": server.pid}
         found = {"time_min": now / 60}
         for role, pid in pids.items():
             status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
@@ -118,8 +119,7 @@ def _available() -> dict[str, float]:
 
 
 @pytest.fixture
-def soak(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Soak]:
-    monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
+def soak(tmp_path: Path) -> Iterator[Soak]:
     soak = Soak(tmp_path)
     with catalog.locked(soak.run):
         try:
@@ -135,10 +135,13 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
     end_s, iteration, committed_n = time.monotonic() + 60 * MINUTES, 0, 0
     while time.monotonic() < end_s:
         plans: list[EpisodePlan] = seeding.training_plans(soak.config, iteration)
-        numbers = []
-        for episode in soak.executor.sample(plans, replace(untrained, version=iteration)):
-            numbers.append(episode.summary["episode_id"][0].as_py())
+        numbers: list[int] = []
+
+        def keep(episode: Episode, numbers: list[int] = numbers) -> None:
+            numbers.append(episode.episode_id)
             soak.episode_came()
+
+        soak.executor.sample(plans, replace(untrained, version=iteration), keep)
         assert sorted(numbers) == [plan.episode_id for plan in plans]
         committed_n += len(numbers)
         iteration += 1
@@ -155,9 +158,9 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
     assert ledger.counters["committed"] == committed_n
     assert ledger.counters["quarantined"] == 0
     assert soak.faults["kill"] + soak.faults["stop"] > 2
-    assert figures["holder_mb"] < STEEPEST_MB_PER_MIN
+    assert figures["policy_server_mb"] < STEEPEST_MB_PER_MIN
     assert figures["driver_mb"] < STEEPEST_MB_PER_MIN
-    for name in ("driver_threads", "driver_descriptors", "holder_threads", "holder_descriptors"):
+    for name in ("driver_threads", "driver_descriptors", "policy_server_threads", "policy_server_descriptors"):
         assert figures[name] * MINUTES < 10  # in the whole time; a leak of one at every fault would be more
     assert soak.measured[-1]["object_store_mb"] < 50
     assert not ledger.leases

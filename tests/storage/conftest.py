@@ -33,11 +33,11 @@ def run(tmp_path: Path) -> Run:
 
 @pytest.fixture
 def commit(make_episode: Callable[..., Episode]) -> Commit:
-    """Commit an iteration of three synthetic episodes, given out of order, and return them in order."""
+    """Commit an iteration of three synthetic episodes, and return them."""
 
     def commit_three(run: Run, iteration: int) -> list[Episode]:
         episodes = [make_episode(100 * iteration + index, iteration) for index in range(3)]
-        tables.commit_iteration(run, iteration, episodes[::-1], iteration_row(iteration), class_rows(iteration))
+        tables.commit_iteration(run, iteration, iter(episodes), iteration_row(iteration), class_rows(iteration))
         return episodes
 
     return commit_three

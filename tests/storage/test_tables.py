@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from collections.abc import Iterable
 from pathlib import Path
 from typing import Any
 
@@ -114,10 +115,10 @@ def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by
     done: list[str] = []
     real = tables._commit
 
-    def crash(run: Run, table: str, iteration: int, groups: list[pa.Table]) -> None:
+    def crash(run: Run, table: str, iteration: int, groups: Iterable[pa.Table]) -> None:
         if len(done) == len(committed.split()):
             if file_written:
-                parquet.write(run.tables / table / f"iteration-{iteration:06d}.parquet", groups)
+                parquet.write(run.tables / table / f"iteration-{iteration:06d}.parquet", schema.TABLES[table], groups)
             raise KeyboardInterrupt
         real(run, table, iteration, groups)
         done.append(table)
@@ -164,7 +165,7 @@ def test_iterations_are_committed_in_turn(run: Run, commit: Any) -> None:
 def _bad(good: Episode, row: dict[str, object], classes: list[dict[str, object]]) -> list[tuple[Any, ...]]:
     return [
         ([], row, classes, "no episodes"),
-        ([good, good], row, classes, "given twice"),
+        ([good, good], row, classes, "each once; found 1 after 1"),
         ([good], row | {"speed": 1}, classes, "exactly"),
         ([good], {"iteration": 0}, classes, "exactly"),
         ([good], row | {"iteration": 1}, classes, "belongs to iteration 1"),

@@ -12,7 +12,6 @@ import pytest
 from t6gps.service.bench import pool, registry
 from t6gps.service.bench.role_clock import ROLES, RoleClock
 from t6gps.service.bench.tally import Tally, machine_s
-from t6gps.service.pool import deadlines
 from t6gps.storage.errors import ConfigError
 
 EFFICIENCIES = ["efficiency_1"] + [f"efficiency_2{peer}" for peer in ("", "_pipes", "_async_vector_env", "_rllib")]
@@ -22,7 +21,6 @@ LATENCIES = ["weight_latency_p95_s", "kill_recovery_p95_s", "hang_recovery_p95_s
 
 @pytest.mark.slow
 def test_every_figure_is_there_and_positive(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
     monkeypatch.setattr(pool, "SIZES", (600, 1200))
     found = registry.measure("pool", seconds=1.0, rounds=1)
     assert found["notes"] == list(pool.NOTES)

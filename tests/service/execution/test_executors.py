@@ -54,7 +54,7 @@ class Kills(Silent):
             os.kill(worker.identity.pid, signal.SIGKILL)
         if (iteration, phase) == (1, "fit") and "learner" not in self.done:
             self.done.add("learner")
-            ray.kill(self.executor._learner)
+            self.executor.learner.kill()
 
 
 class Stops(Silent):

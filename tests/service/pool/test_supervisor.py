@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from itertools import pairwise
 from typing import Any
 
@@ -11,7 +11,7 @@ import pytest
 from t6gps.service.pool import supervisor as supervising
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.control import Control
-from t6gps.service.pool.deadlines import FACTOR, SHORTEST_S, EpisodeTimes
+from t6gps.service.pool.deadlines import FACTOR, TIMINGS, EpisodeTimes
 from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.supervisor import PLANS_PER_WORKER, Pool
 from t6gps.service.pool.transport import Alive, Died, Done, Handle, Identity, Ready, Remains, Report, Transport
@@ -22,6 +22,7 @@ from t6gps.workers import stub
 
 POLICY = PolicySnapshot(0, (), 1.0, 0.2)
 SETTINGS, START_S, EPISODE_S = "settings", 1.0, 0.5
+SHORTEST_S = TIMINGS.shortest_episode_s
 
 
 def plans(n: int) -> list[EpisodePlan]:
@@ -159,9 +160,16 @@ class House:
     def ready(self) -> int:
         return int(self.pool.status(self.paper.now_s)["ready"])
 
-    def sample(self) -> Iterator[int]:
-        for episode in self.pool.arrivals():
-            yield episode.summary["episode_id"][0].as_py()
+    def sample(self, after_each: Callable[[list[int]], None] = lambda _: None) -> list[int]:
+        """Numbers of the episodes in the order of their arrival; `after_each` sees those that there are so far."""
+        found: list[int] = []
+
+        def keep(episode: Episode) -> None:
+            found.append(episode.episode_id)
+            after_each(found)
+
+        self.pool.sample(keep)
+        return found
 
 
 def test_every_planned_episode_arrives_once() -> None:
@@ -173,49 +181,54 @@ def test_every_planned_episode_arrives_once() -> None:
 
 def test_no_worker_has_more_than_two_plans_and_what_waits_for_the_learner_counts() -> None:
     house = House(2, 30)
-    episodes = house.sample()
-    next(episodes)
-    for _ in range(100):  # the learner is busy, the pool is tended
-        house.pool.tick(0.1)
-    assert len(house.ledger.leases) + house.ledger.arrived == 2 * PLANS_PER_WORKER
+
+    def pause(found: list[int]) -> None:
+        if len(found) == 1:
+            for _ in range(100):  # the learner is busy, the pool is tended
+                house.pool.tick(0.1)
+            assert len(house.ledger.leases) + house.ledger.arrived == 2 * PLANS_PER_WORKER
+
+    assert len(house.sample(pause)) == 30
     assert house.paper.most_in_flight <= 2 * PLANS_PER_WORKER
-    assert len(list(episodes)) == 29
 
 
 def test_large_episodes_are_under_way_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(supervising, "BYTES_IN_FLIGHT", 1)
     house = House(2, 10)
-    episodes = house.sample()
-    for _ in range(5):
-        next(episodes)
-    house.paper.most_in_flight = 0
-    assert len(list(episodes)) == 5
+
+    def begin_to_count(found: list[int]) -> None:
+        if len(found) == 5:
+            house.paper.most_in_flight = 0
+
+    assert len(house.sample(begin_to_count)) == 10
     assert house.paper.most_in_flight == 1
 
 
 def test_a_worker_that_dies_is_replaced_and_its_episodes_are_run_again() -> None:
     house = House(2, 20)
-    episodes = house.sample()
-    found = [next(episodes)]
-    victim = next(iter(house.paper.alive))
-    house.paper.die(victim)
-    found += list(episodes)
-    assert sorted(found) == list(range(20))
+
+    def kill(found: list[int]) -> None:
+        if len(found) == 1:
+            house.paper.die(next(iter(house.paper.alive)))
+
+    assert sorted(house.sample(kill)) == list(range(20))
     assert house.pool.workers[0].incarnation == 2
     assert house.until(lambda: house.pool.state == "RUNNING", 5) <= 5
 
 
 def test_all_workers_die_at_once_and_the_run_recovers_by_itself() -> None:
     house = House(3, 30)
-    episodes = house.sample()
-    found = [next(episodes)]
-    for handle in list(house.paper.alive):
-        house.paper.die(handle)
-    house.pool.tick()
-    assert house.pool.state == "DEGRADED"
-    assert "0 of 3 workers" in house.pool.reason
-    assert house.until(lambda: house.pool.state == "RUNNING", 5) <= 5
-    assert sorted(found + list(episodes)) == list(range(30))
+
+    def kill_all(found: list[int]) -> None:
+        if len(found) == 1:
+            for handle in list(house.paper.alive):
+                house.paper.die(handle)
+            house.pool.tick()
+            assert house.pool.state == "DEGRADED"
+            assert "0 of 3 workers" in house.pool.reason
+            assert house.until(lambda: house.pool.state == "RUNNING", 5) <= 5
+
+    assert sorted(house.sample(kill_all)) == list(range(30))
 
 
 def test_back_off_doubles_up_to_its_cap_and_the_breaker_opens_with_the_reason() -> None:
@@ -246,13 +259,12 @@ def test_back_off_is_capped_and_a_slot_that_cannot_start_does_not_end_a_run_that
 def test_a_hang_is_found_by_its_deadline_and_its_stacks_are_kept() -> None:
     house = House(2, 30)
     house.paper.hanging.add(7)
-    episodes = house.sample()
-    found = []
-    for episode in episodes:
-        found.append(episode)
+
+    def mend(_: list[int]) -> None:
         if 7 in house.ledger.failures:
             house.paper.hanging.clear()
-    assert sorted(found) == list(range(30))
+
+    assert sorted(house.sample(mend)) == list(range(30))
     (failure,) = house.ledger.failures[7]
     assert (failure.kind, failure.seed) == ("hang", 107)
     assert failure.trace.startswith("stacks of")
@@ -273,15 +285,15 @@ def test_an_episode_that_hangs_again_gets_twice_the_time() -> None:
 
 def test_a_worker_ten_times_slower_does_not_hang() -> None:
     house = House(1, 5)
-    list(house.sample())
+    house.sample()
     house.paper.episode_s = 10 * EPISODE_S
     house.ledger.open([EpisodePlan(9, 0, 9, 1, 4, 0, 0.0, 0.1, 0)])
-    assert list(house.sample()) == [9]
+    assert house.sample() == [9]
     assert house.pool.counters["hung"] == 0
 
 
 def test_deadlines_follow_the_measured_times_and_the_length_of_the_episode() -> None:
-    times = EpisodeTimes()
+    times = EpisodeTimes(SHORTEST_S)
     unknown = times.deadline_s(100)
     for _ in range(50):
         times.add(10.0, 100)
@@ -322,22 +334,27 @@ def test_a_run_in_which_everything_fails_ends_with_one_sentence() -> None:
     house = House(2, 50)
     house.paper.raising = set(range(50))
     with pytest.raises(RunError, match=r"nothing but failures comes back; the last: episode \d+: PhysicsError"):
-        list(house.sample())
+        house.sample()
     assert house.pool.state == "FAILED"
 
 
 def test_scaling_reaches_its_wish_while_sampling_and_loses_nothing() -> None:
     house = House(1, 60)
-    episodes = house.sample()
-    found = [next(episodes)]
-    for wish in (3, 1, 2):
-        house.wishes.wished = wish
-        start_s = house.paper.now_s
-        while house.ready != wish or len(house.pool.workers) != wish:
-            found.append(next(episodes))
-            assert house.paper.now_s - start_s <= 5
-    found += list(episodes)
-    assert sorted(found) == list(range(60))
+    wishes, asked_s = [3, 1, 2], 0.0
+
+    def scale(_: list[int]) -> None:
+        nonlocal asked_s
+        if not asked_s:
+            house.wishes.wished, asked_s = wishes[0], house.paper.now_s
+        assert house.paper.now_s - asked_s <= 5
+        if house.ready == wishes[0] == len(house.pool.workers) and len(wishes) > 1:
+            wishes.pop(0)
+            asked_s = 0.0
+        elif len(wishes) == 1:
+            asked_s = house.paper.now_s
+
+    assert sorted(house.sample(scale)) == list(range(60))
+    assert house.ready == wishes[0] == 2
     assert house.ledger.counters["duplicates"] == 0
     assert house.pool.counters["crashed"] == 0
 
@@ -358,13 +375,15 @@ def test_a_draining_worker_finishes_its_episode_and_hands_the_other_back() -> No
 
 def test_scaled_to_nothing_a_run_pauses_and_goes_on_when_it_is_scaled_up() -> None:
     house = House(2, 10)
-    episodes = house.sample()
-    found = [next(episodes)]
-    house.wishes.wished = 0
-    house.until(lambda: not house.pool.workers, 5)
-    assert house.pool.state == "PAUSED"
-    house.wishes.wished = 1
-    assert sorted(found + list(episodes)) == list(range(10))
+
+    def pause(found: list[int]) -> None:
+        if len(found) == 1:
+            house.wishes.wished = 0
+            house.until(lambda: not house.pool.workers, 5)
+            assert house.pool.state == "PAUSED"
+            house.wishes.wished = 1
+
+    assert sorted(house.sample(pause)) == list(range(10))
 
 
 def test_a_worker_that_waits_for_a_cpu_is_named_and_comes_when_there_is_one() -> None:
@@ -384,13 +403,15 @@ def test_a_worker_that_waits_for_a_cpu_is_named_and_comes_when_there_is_one() ->
 def test_autoscaling_follows_the_backlog_and_the_room() -> None:
     house = House(1, 40, autoscale=(1, 4))
     house.paper.room = 3
-    episodes = house.sample()
-    next(episodes)
-    house.until(lambda: house.ready == 3, 5)
-    house.paper.room += 5  # a node joins
-    house.until(lambda: house.ready == 4, 5)
-    list(episodes)
-    house.run(supervising.SHRINK_AFTER_S + 2)
+
+    def watch(found: list[int]) -> None:
+        if len(found) == 1:
+            house.until(lambda: house.ready == 3, 5)
+            house.paper.room += 5  # a node joins
+            house.until(lambda: house.ready == 4, 5)
+
+    house.sample(watch)
+    house.run(TIMINGS.shrink_after_s + 2)
     assert house.ready == 1
 
 
@@ -402,5 +423,5 @@ def test_a_worker_with_other_settings_or_another_policy_ends_the_run() -> None:
     house = House(1, 3)
     house.paper.digest = "another"
     with pytest.raises(RunError, match="another policy than version 0"):
-        list(house.sample())
+        house.sample()
     assert house.ledger.counters["committed"] == 0

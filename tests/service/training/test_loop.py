@@ -1,6 +1,6 @@
 """Laws of the training loop: a run that was stopped anywhere goes on as if it had not been."""
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -9,11 +9,12 @@ import pytest
 
 from t6gps.learner import value
 from t6gps.service.config import Config, load
+from t6gps.service.execution.executor import Keep, Purpose
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.service.training import evaluation, loop
 from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import EpisodePlan, PolicySnapshot
 
 TINY = [
     "run.iterations=3",
@@ -48,12 +49,18 @@ class StopsAfter(SerialExecutor):
         super().__init__(config)
         self._episodes, self._phase, self._learned = episodes, phase, 0
 
-    def sample(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot) -> Iterator[Episode]:
+    def sample(
+        self,
+        plans: Sequence[EpisodePlan],
+        snapshot: PolicySnapshot,
+        keep: Keep,
+        purpose: Purpose = Purpose.TRAINING,
+    ) -> None:
         for plan in plans:
             if self._episodes == 0:
                 raise KeyboardInterrupt
             self._episodes = None if self._episodes is None else self._episodes - 1
-            yield from super().sample([plan], snapshot)
+            super().sample([plan], snapshot, keep, purpose)
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         self._learned += phase == "segment"
@@ -65,11 +72,8 @@ class StopsAfter(SerialExecutor):
 class SamplesAhead(StopsAfter):
     """Has two episodes of the next iteration in the spool when the learner begins, as workers may have."""
 
-    def sample_ahead(
-        self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Callable[[Episode], None]
-    ) -> None:
-        for episode in self.sample(plans[:2], snapshot):
-            keep(episode)
+    def sample_ahead(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, keep: Keep) -> None:
+        self.sample(plans[:2], snapshot, keep)
 
 
 def trained(config: Config, this: Run, executor: SerialExecutor) -> Silent:
@@ -213,7 +217,7 @@ def test_an_evaluation_is_noise_free_repeatable_and_kept(config: Config, uninter
         executor = SerialExecutor(config)
         latest = checkpoint.load_latest(uninterrupted.checkpoints)
         assert latest is not None
-        executor.ask("restore", *latest[1:])
+        executor.learner.restore(*latest[1:])
         results.append(evaluation.evaluate(config, executor, 3, seed=1, terrain_seed=None, observer=Silent()))
         executor.close()
     assert results[0] == results[1]

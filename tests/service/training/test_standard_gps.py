@@ -13,6 +13,7 @@ from t6gps.service.config import Config, load
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.storage import schema
 from t6gps.storage.errors import ConfigError
+from t6gps.storage.records import Episode
 from t6gps.workers.robot.symmetry import CABLE_MAP, world_map
 
 DIRECTIONS, STEPS = 3, 30
@@ -43,8 +44,9 @@ def executor(config: Config) -> SerialExecutor:
 
 @pytest.fixture(scope="module")
 def episodes(config: Config, executor: SerialExecutor) -> dict[int, pa.Table]:
-    sampled = executor.sample(seeding.training_plans(config, 0), executor.ask("policy"))
-    return {episode.frames["episode_id"][0].as_py(): episode.frames for episode in sampled}
+    sampled: list[Episode] = []
+    executor.sample(seeding.training_plans(config, 0), executor.learner.policy(), sampled.append)
+    return {episode.episode_id: episode.frames for episode in sampled}
 
 
 def test_rows_are_in_world_axes(episodes: dict[int, pa.Table]) -> None:

@@ -1,0 +1,176 @@
+"""The learner as a Ray actor, and the supervisor's side of it.
+
+Episodes reach it as references into the object store, which it reads without a copy; it takes what it needs of one and
+lets go of it. Its fits run as Ray tasks beside it.
+"""
+
+from __future__ import annotations
+
+import math
+import time
+from collections import deque
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Any
+
+import ray
+from numpy.typing import NDArray
+
+from t6gps.service.config import Config
+from t6gps.service.pool import control
+from t6gps.service.ray_backend.cluster import start_actor
+from t6gps.service.ray_backend.worker_actor import Answer
+from t6gps.storage import ipc, spool
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
+from t6gps.storage.records import PolicySnapshot
+
+EPISODES_UNDER_WAY_N = 32
+"""Episodes on their way to the learner. When it takes no more, sampling waits: the object store is bounded."""
+
+
+class LearnerActor:
+    """The learner in a process of its own."""
+
+    def __init__(self, config: Config) -> None:
+        from t6gps.service.execution.wiring import new_learner  # it loads torch, which the supervisor does without
+
+        self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
+
+    def add(self, answer: Answer) -> None:
+        """Take an episode that lies in the object store."""
+        assert answer.packed is not None, "only episodes are streamed"
+        self._learner.add(ipc.unpack(answer.packed, 1)[0])
+
+    def add_spooled(self, files: Sequence[Path]) -> None:
+        """Take episodes that lie in the spool."""
+        for file in files:
+            self._learner.add(spool.read(file).frames)
+
+    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
+        """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""
+        told_s = -math.inf
+        for done, total in getattr(self._learner, phase)():
+            if done == total or time.monotonic() - told_s >= control.TICK_S:
+                told_s = time.monotonic()
+                yield done, total
+
+    def policy(self, version: int | None) -> PolicySnapshot:
+        return self._learner.policy(version)
+
+    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        return self._learner.report()
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        return self._learner.state()
+
+    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        self._learner.restore(manifest, arrays)
+
+    def recall(self, run: Run) -> None:
+        self._learner.recall(run)
+
+
+class RayLearner:
+    """The learner's actor, as a `LearnerPort`; every call raises LearnerDiedError when its process is gone.
+
+    until_done   waits for a reference to be there, and tends the pool meanwhile
+    """
+
+    def __init__(self, config: Config, node: str, until_done: Callable[[Any], None]) -> None:
+        self.actor = start_actor(LearnerActor, config, where=node)
+        self._until_done = until_done
+        self._taken: list[Any] = []
+
+    def add(self, reference: Any) -> None:
+        """Send an episode by its reference in the object store; waits while too many are on their way.
+
+        How it went is asked by `learn`: sampling goes on when the learner has died.
+        """
+        self._taken.append(self.actor.add.remote(reference))
+        if len(self._taken) > EPISODES_UNDER_WAY_N:
+            self._until_done(self._taken[-EPISODES_UNDER_WAY_N])
+
+    def add_spooled(self, files: Sequence[Path]) -> None:
+        """Let it read episodes from the spool, while others are sampled; `learn` asks how it went."""
+        self._taken.append(self.actor.add_spooled.remote(files))
+
+    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
+        """Run a phase; yields (done, total)."""
+        while self._taken:
+            self._answer(self._taken[-1])
+            self._taken.pop()
+        steps = self.actor.learn.options(num_returns="streaming").remote(phase)
+        while True:
+            self._until_done(steps)
+            try:
+                step = next(steps)
+            except StopIteration:
+                return
+            yield self._answer(step)
+
+    def policy(self, version: int | None = None) -> PolicySnapshot:
+        snapshot: PolicySnapshot = self._answer(self.actor.policy.remote(version))
+        return snapshot
+
+    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+        rows: tuple[dict[str, Any], list[dict[str, Any]]] = self._answer(self.actor.report.remote())
+        return rows
+
+    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+        state: tuple[dict[str, Any], dict[str, NDArray[Any]]] = self._answer(self.actor.state.remote())
+        return state
+
+    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+        self._answer(self.actor.restore.remote(manifest, arrays))
+
+    def recall(self, run: Run) -> None:
+        self._answer(self.actor.recall.remote(run))
+
+    def kill(self) -> None:
+        """End its process at once."""
+        ray.kill(self.actor)
+
+    def _answer(self, reference: Any) -> Any:
+        self._until_done(reference)
+        try:
+            return _get(reference)
+        except RunError as error:
+            if isinstance(error.__cause__, ray.exceptions.ActorDiedError | ray.exceptions.ActorUnavailableError):
+                raise LearnerDiedError(f"the learner's process died: {error.__cause__}") from error
+            raise
+
+
+def _get(reference: Any) -> Any:
+    """The value behind a reference. An error of this package comes as itself, the death of a process as RunError."""
+    try:
+        return ray.get(reference)
+    except ray.exceptions.RayTaskError as error:
+        if isinstance(error.cause, T6GpsError):
+            raise error.cause from error
+        raise
+    except ray.exceptions.RayError as error:
+        raise RunError(
+            f"a process of the run died ({type(error).__name__}); everything sampled so far is kept: go on with "
+            "--resume, and with fewer --workers if memory ran out"
+        ) from error
+
+
+def _task_map(width: int) -> Callable[..., Iterator[Any]]:
+    """A `map` that runs up to `width` calls at once as Ray tasks and yields their results in order.
+
+    The tasks claim no CPU: the workers hold the CPUs, and leave them idle while the learner works, or share them in
+    a pipelined run.
+    """
+
+    def task_map(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
+        task = ray.remote(num_cpus=0, max_retries=3)(function)
+        pending: deque[Any] = deque()
+        for job in jobs:
+            pending.append(task.remote(job))
+            if len(pending) == width:
+                yield _get(pending.popleft())
+        for result in pending:
+            yield _get(result)
+
+    return task_map
