@@ -20,7 +20,7 @@ LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 CONSOLE = re.compile(r"^ *```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`]+)`")
-COMMIT = re.compile(r"(?<![\w,.])(?=[0-9a-f]*\d)[0-9a-f]{7}(?![\w,.]\d)\b")
+COMMIT = re.compile(r"\b(?=[0-9a-f]*\d)[0-9a-f]{7}\b")
 PAGES_WITH_COMMITS = {"docs/lab-notes.md", "docs/algorithm.md", "docs/reliability.md"}
 """The lab notes, and pages that are still to lose their commits."""
 SUMMARIES = ("README.md", "docs/results.md")
