@@ -71,14 +71,16 @@ def _complaints(arguments: list[str]) -> list[str]:
         return [f"t6gps {name}: no such command"]
     options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
     words = [word.strip("[]") for word in rest]
-    found = [
+    unknown = [
         f"t6gps {name} {word}: no such option"
         for word in words
         if word[:2] == "--" and word.split("=")[0] not in options
     ]
     keys = [key for before, key in pairwise(words) if before == "--set" and "=" in key]
     keys += [word.removeprefix("--set=") for word in words if word.startswith("--set=")]
-    return found + [f"t6gps {name} --set {key}: no such setting" for key in keys if not _is_setting(key.split("=")[0])]
+    return unknown + [
+        f"t6gps {name} --set {key}: no such setting" for key in keys if not _is_setting(key.split("=")[0])
+    ]
 
 
 def _is_setting(key: str) -> bool:
