@@ -41,5 +41,10 @@ bench: install
 soak: install
 	T6GPS_SOAK_MINUTES=30 $(BIN)/pytest -s tests/faults/test_workers.py tests/faults/test_soak.py -k 't1_ or t13 or t14'
 
+# Tables of measured figures in README.md and docs, from docs/figures.
+.PHONY: docs
+docs: install
+	$(BIN)/python docs/render.py
+
 clean:
 	rm -rf build dist *.egg-info .pytest_cache .mypy_cache .ruff_cache

@@ -1,0 +1,106 @@
+"""Renders the tables of measured figures: docs/figures/NAME.json into README.md and the pages of docs.
+
+A page says where a table goes; what stands between the two markers is replaced:
+
+    <!-- figures: NAME -->
+    <!-- end -->
+
+A file in docs/figures is one measurement:
+
+    command   what was run, several joined by &&; null for code that is no part of this package
+    commit    the commit that was measured, several joined by commas
+    machine   what it ran on
+    date      day of that commit
+    notes     what else one must know to read or repeat it (may be absent)
+    columns   {"name", "digits", "unit"} each: digits after the point, and what follows each number (both may be absent)
+    rows      cells: text, a number, {"mean", "sd"}, a list of numbers (one per seed), or null for what was not measured
+
+Run as a program (`make docs`), it writes the pages anew.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import re
+import textwrap
+from pathlib import Path
+from typing import Any
+
+REPOSITORY = Path(__file__).parents[1]
+FIGURES = REPOSITORY / "docs" / "figures"
+MARKED = re.compile(r"<!-- figures: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
+PROVENANCE = ("command", "commit", "machine", "date")
+LINE_WIDTH = 120
+
+
+class FiguresError(Exception):
+    """A measurement that is missing or incomplete, or a marker that is never closed."""
+
+
+def pages() -> list[Path]:
+    """Every page that may hold measured figures."""
+    return [REPOSITORY / "README.md", *sorted((REPOSITORY / "docs").rglob("*.md"))]
+
+
+def load(name: str, folder: Path = FIGURES) -> dict[str, Any]:
+    """The measurement of that name. FiguresError where there is none or its origin is not stated."""
+    file = folder / f"{name}.json"
+    if not file.is_file():
+        known = ", ".join(sorted(path.stem for path in folder.glob("*.json")))
+        raise FiguresError(f"no figures '{name}'; allowed: {known}; add docs/figures/{name}.json or mend the marker")
+    measurement: dict[str, Any] = json.loads(file.read_text(encoding="utf-8"))
+    missing = [key for key in (*PROVENANCE, "columns", "rows") if key not in measurement]
+    if missing:
+        raise FiguresError(f"docs/figures/{name}.json lacks {', '.join(missing)}; write null for what is unknown")
+    return measurement
+
+
+def cell(value: Any, digits: int = 0, unit: str = "") -> str:
+    """One cell of a table as text: numbers with `digits` after the point and `unit` behind them."""
+    if value is None:
+        return "-"
+    if isinstance(value, str):
+        return value
+    if isinstance(value, dict):
+        number = f"{value['mean']:,.{digits}f} +- {value['sd']:,.{digits}f}"
+    elif isinstance(value, list):
+        number = ", ".join("(not run)" if item is None else f"{item:,.{digits}f}" for item in value)
+    else:
+        number = f"{value:,.{digits}f}"
+    return f"{number} {unit}".rstrip()
+
+
+def table(name: str, page: Path) -> str:
+    """The table of a measurement in Markdown, and below it the command, machine and day, with a link to the file."""
+    measurement = load(name)
+    columns = measurement["columns"]
+    lines = ["| " + " | ".join(column["name"] for column in columns) + " |", "|---" * len(columns) + "|"]
+    for row in measurement["rows"]:
+        if len(row) != len(columns):
+            raise FiguresError(f"docs/figures/{name}.json: row {row[0]!r} has {len(row)} cells, not {len(columns)}")
+        cells = (
+            cell(value, column.get("digits", 0), column.get("unit", ""))
+            for value, column in zip(row, columns, strict=True)
+        )
+        lines.append("| " + " | ".join(cells) + " |")
+    link = os.path.relpath(FIGURES / f"{name}.json", page.parent)
+    command = f"`{measurement['command']}`, " if measurement["command"] else ""
+    where = ", ".join(filter(None, (measurement["machine"], measurement["date"])))
+    source = textwrap.fill(
+        f"*{command}{where} ([data]({link})).*", LINE_WIDTH, break_long_words=False, break_on_hyphens=False
+    )
+    return "\n".join([*lines, "", source])
+
+
+def rendered(page: Path) -> str:
+    """The page's text with every marked table as its measurement says. FiguresError for a marker without an end."""
+    text = page.read_text(encoding="utf-8")
+    if text.count("<!-- figures: ") != len(MARKED.findall(text)):
+        raise FiguresError(f"{page}: a marker of figures has no end; close it with <!-- end -->")
+    return MARKED.sub(lambda mark: f"<!-- figures: {mark[1]} -->\n{table(mark[1], page)}\n<!-- end -->", text)
+
+
+if __name__ == "__main__":
+    for path in pages():
+        path.write_text(rendered(path), encoding="utf-8")

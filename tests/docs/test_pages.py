@@ -1,0 +1,158 @@
+"""Laws of the documents: what they link to and call exists, and they are short."""
+
+from __future__ import annotations
+
+import json
+import re
+import shlex
+from collections.abc import Iterator
+from itertools import pairwise
+from pathlib import Path
+
+import click
+import pytest
+import typer.main
+
+from t6gps.service.cli.main import app
+from t6gps.service.config import Config
+
+LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
+FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
+CONSOLE = re.compile(r"^ *```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+CODE = re.compile(r"`([^`]+)`")
+COMMIT = re.compile(r"\b(?=[0-9a-f]*\d)[0-9a-f]{7}\b")
+PAGES_WITH_COMMITS = {"docs/lab-notes.md", "docs/algorithm.md", "docs/reliability.md"}
+"""The lab notes, and pages that are still to lose their commits."""
+SUMMARIES = ("README.md", "docs/results.md")
+COMMAND: click.Command = typer.main.get_command(app)
+
+
+def _slug(heading: str) -> str:
+    """The anchor that GitHub gives to a heading."""
+    return re.sub(r"[^\w\- ]", "", CODE.sub(r"\1", heading).strip().lower()).replace(" ", "-")
+
+
+def _anchors(text: str) -> set[str]:
+    return {_slug(heading) for heading in re.findall(r"^#+ (.*)$", FENCE.sub("", text), re.MULTILINE)}
+
+
+def _calls(text: str) -> Iterator[list[str]]:
+    """Arguments of every call of `t6gps` in blocks of commands and in code within the prose."""
+    for block in CONSOLE.findall(text):
+        yield from _arguments(block)
+    for code in CODE.findall(FENCE.sub("", text)):
+        yield from _arguments(" ".join(code.split()))
+
+
+def _arguments(commands: str) -> Iterator[list[str]]:
+    lexer = shlex.shlex(commands.replace("\n", "\n; "), posix=True, punctuation_chars=";&|")
+    lexer.whitespace_split = True
+    call: list[str] | None = None
+    for token in lexer:
+        if set(token) <= set(";&|"):
+            if call:
+                yield call
+            call = None
+        elif call is not None:
+            call.append(token)
+        elif token == "t6gps":
+            call = []
+    if call:
+        yield call
+
+
+def _complaints(arguments: list[str]) -> list[str]:
+    """What is wrong with a call: an unknown command, option or setting."""
+    name, *rest = arguments
+    known = getattr(COMMAND, "commands", {})
+    if name.startswith("-"):
+        return []
+    if name not in known:
+        return [f"t6gps {name}: no such command"]
+    options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
+    words = [word.strip("[]") for word in rest]
+    unknown = [
+        f"t6gps {name} {word}: no such option"
+        for word in words
+        if word[:2] == "--" and word.split("=")[0] not in options
+    ]
+    keys = [key for before, key in pairwise(words) if before == "--set" and "=" in key]
+    keys += [word.removeprefix("--set=") for word in words if word.startswith("--set=")]
+    return unknown + [
+        f"t6gps {name} --set {key}: no such setting" for key in keys if not _is_setting(key.split("=")[0])
+    ]
+
+
+def _is_setting(key: str) -> bool:
+    section, _, name = key.partition(".")
+    field = Config.model_fields.get(section)
+    return field is not None and name in getattr(field.annotation, "model_fields", {})
+
+
+def _sentences(text: str) -> list[str]:
+    """The sentences of a page, without tables, captions of tables, code, headings and addresses."""
+    text = re.sub(r"<!--.*?-->", "", CODE.sub("code", FENCE.sub("", text)), flags=re.DOTALL)
+    text = re.sub(
+        r"^(\||#).*$", "", re.sub(r"^\*code.*?\*$", "", text, flags=re.MULTILINE | re.DOTALL), flags=re.MULTILINE
+    )
+    text = re.sub(r"!?\[([^\]]*)\]\([^)]*\)", r"\1", text)
+    blocks = re.split(r"\n\s*\n|^\s*- ", text, flags=re.MULTILINE)
+    return [sentence for block in blocks for sentence in re.split(r"(?<=[.?!])[*\s]+(?=\S)", block) if sentence.strip()]
+
+
+def _words(sentence: str) -> int:
+    return sum(any(letter.isalnum() for letter in word) for word in sentence.split())
+
+
+def test_every_link_and_picture_leads_somewhere(pages: dict[str, str], repository: Path) -> None:
+    broken = []
+    for page, text in pages.items():
+        for target in LINK.findall(FENCE.sub("", text)):
+            if target.startswith(("http://", "https://")):
+                continue
+            name, _, anchor = target.partition("#")
+            file = (repository / page).parent / name if name else repository / page
+            if not file.exists() or (anchor and anchor not in _anchors(file.read_text(encoding="utf-8"))):
+                broken.append(f"{page}: {target}")
+    assert not broken
+
+
+def test_every_page_and_picture_is_linked(pages: dict[str, str], repository: Path) -> None:
+    linked = {
+        ((repository / page).parent / target.partition("#")[0]).resolve()
+        for page, text in pages.items()
+        for target in LINK.findall(text)
+    }
+    wanted = {repository / page for page in pages} | set((repository / "docs" / "images").iterdir())
+    assert {file for file in wanted if file.name not in {"README.md", "CONTRIBUTING.md"}} <= linked
+
+
+def test_every_command_option_and_setting_on_a_page_exists(pages: dict[str, str]) -> None:
+    complaints = [
+        f"{page}: {wrong}" for page, text in pages.items() for call in _calls(text) for wrong in _complaints(call)
+    ]
+    assert not complaints
+
+
+def test_every_command_of_a_measurement_exists(repository: Path) -> None:
+    commands = [json.loads(file.read_text())["command"] or "" for file in (repository / "docs" / "figures").iterdir()]
+    calls = [call for command in commands for call in _arguments(command)]
+    assert len(calls) >= len([command for command in commands if command])
+    assert not [wrong for call in calls for wrong in _complaints(call)]
+
+
+@pytest.mark.parametrize("call", ["trian flat", "train flat --quick", "eval RUN --set terrain.steepness=1"])
+def test_a_call_of_something_unknown_is_seen(call: str) -> None:
+    assert _complaints(next(_arguments(f"t6gps {call}")))
+
+
+def test_pages_name_no_commits(pages: dict[str, str]) -> None:
+    named = {page: COMMIT.findall(text) for page, text in pages.items() if page not in PAGES_WITH_COMMITS}
+    assert not {page: commits for page, commits in named.items() if commits}
+
+
+@pytest.mark.parametrize("page", SUMMARIES)
+def test_sentences_of_the_summaries_are_short(page: str, pages: dict[str, str]) -> None:
+    lengths = [_words(sentence) for sentence in _sentences(pages[page])]
+    assert sum(lengths) / len(lengths) <= 22
+    assert max(lengths) <= 25
