@@ -24,10 +24,10 @@ from typing import Any
 from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import NotingWorker, Tally, steps_of
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Ending
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool import control
 from t6gps.service.pool.attempt import Failure, attempt
+from t6gps.service.pool.state import RunState
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -182,9 +182,11 @@ def opened(config: Config, **options: Any) -> Iterator[tuple[RayExecutor, Spool]
         with closing(RayExecutor(config, run, **options)) as executor:
             executor.learner.policy()  # it is ready
             deadline_s = time.monotonic() + START_DEADLINE_S
-            while executor.pool.state != "RUNNING":
+            while executor.pool.state.condition is not RunState.RUNNING:
                 if time.monotonic() > deadline_s:
-                    raise RunError(f"the workers did not start within {START_DEADLINE_S:.0f} s: {executor.pool.reason}")
+                    raise RunError(
+                        f"the workers did not start within {START_DEADLINE_S:.0f} s: {executor.pool.state.reason}"
+                    )
                 executor.pool.tick(control.TICK_S)
             yield executor, Spool(run.spool, 0)
-            executor.close(Ending.DONE)
+            executor.close(RunState.DONE)

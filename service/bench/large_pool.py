@@ -27,10 +27,10 @@ from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import Tally, steps_of
 from t6gps.service.config import Config
 from t6gps.service.pool.control import Control
-from t6gps.service.pool.deadlines import TIMINGS
+from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.supervisor import Pool
-from t6gps.service.pool.transport import Identity
+from t6gps.service.pool.pool import Pool
+from t6gps.service.pool.state import Identity, PoolState, RunState, WorkerId
 from t6gps.service.ray_backend.cluster import join_or_start, this_node
 from t6gps.service.ray_backend.transport import Call, RayTransport, Remote
 from t6gps.service.ray_backend.worker_actor import Answer, Greeting
@@ -58,7 +58,7 @@ class SlotsActor:
     async def open(self, slot: int) -> Greeting:
         """Make a slot; as WorkerActor.open, but with no process to end with it."""
         self._turns[slot] = asyncio.Lock()
-        return Greeting(Identity(os.getpid(), socket.gethostname(), ""), None, this_node())
+        return Greeting(Identity(os.getpid(), socket.gethostname(), this_node(), ""), None)
 
     async def ping(self) -> None:
         """A sign of life."""
@@ -76,12 +76,6 @@ def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
     return table.set_column(column, field, pa.array(np.full(table.num_rows, plan.episode_id), field.type))
 
 
-class _Slot(Remote):
-    def __init__(self, actor: Any, number: int) -> None:
-        super().__init__(actor)
-        self.number = number
-
-
 class SlotsTransport(RayTransport):
     """Workers as slots of a few actors."""
 
@@ -91,14 +85,12 @@ class SlotsTransport(RayTransport):
         made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=4 * slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
 
-    def start(self, slot: int, incarnation: int) -> Remote:
-        remote = _Slot(self._actors[slot % PROCESSES_N], slot)
-        self._await(Call(remote, remote.actor.open.remote(slot)))
-        return remote
+    def start(self, worker: WorkerId) -> None:
+        actor = self._actors[worker.slot % PROCESSES_N]
+        self._begin(worker, Remote(actor), actor.open.remote(worker.slot))
 
-    def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        assert isinstance(handle, _Slot)
-        self._await(Call(handle, handle.actor.run.remote(handle.number, plan), plan))
+    def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
+        self._await(Call(worker, self._remotes[worker].actor.run.remote(worker.slot, plan), plan))
 
     def close(self) -> None:
         """End the actors."""
@@ -157,13 +149,13 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
     plans = seeding.training_plans(_with_episodes(job.config, round(3 * workers_n * (seconds / EPISODE_S + 2))), 0)
     ledger, clock, tally = _TimedLedger(), RoleClock(), Tally(seconds)
     transport = SlotsTransport(job, workers_n)
-    pool = Pool(transport, ledger, workers_n, "", Control(None, workers_n), lambda _: None)
+    state = PoolState(workers_n, "", ledger, TIMINGS, EpisodeTimes(TIMINGS.shortest_episode_s))
+    pool = Pool(state, transport, Control(None, workers_n), lambda _: None)
     with tempfile.TemporaryDirectory() as folder:
         spool = Spool(Path(folder), 0)
-        while pool.state != "RUNNING":
+        while state.condition is not RunState.RUNNING:
             pool.tick(0.1)
-        ledger.open(plans)
-        pool.open({})
+        pool.open(plans, [], {})
         wait_s = main_s = 0.0
 
         def keep(episode: Episode) -> None:

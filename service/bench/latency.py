@@ -19,7 +19,7 @@ import numpy as np
 
 from t6gps.service import seeding
 from t6gps.service.bench.contenders import Enough, Job, opened
-from t6gps.service.pool.workers import Worker
+from t6gps.service.pool.state import Worker, WorkerPhase
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.stub import StubWorker
@@ -78,14 +78,15 @@ def recoveries(job: Job, faults: dict[signal.Signals, int]) -> dict[signal.Signa
         def keep(episode: Episode) -> None:
             nonlocal hit, hit_s, calm_n
             lease = executor.ledger.lease_of(episode.episode_id)
-            if hit and lease and lease.slot == hit.slot and lease.incarnation > hit.incarnation:
+            if hit and lease and lease.slot == hit.id.slot and lease.incarnation > hit.id.incarnation:
                 took_s[due.pop(0)].append(time.monotonic() - hit_s)
                 hit, calm_n = None, int(rng.integers(*BETWEEN_FAULTS))
             spool.append(episode)
             calm_n -= 1
             if not due:
                 raise Enough
-            at_work = [worker for worker in executor.pool.workers.values() if worker.phase == "sampling"]
+            workers = executor.pool.state.workers.values()
+            at_work = [worker for worker in workers if worker.phase is WorkerPhase.SAMPLING]
             if hit is None and calm_n <= 0 and at_work:
                 hit, hit_s = at_work[rng.integers(len(at_work))], time.monotonic()
                 assert hit.identity is not None  # it is at work

@@ -71,7 +71,7 @@ def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) 
         lines.append(f"left out for their failures: episodes {', '.join(map(str, found['quarantined']))}")
     typer.echo("\n".join(lines))
     if found["workers"]:
-        terminal.print_rows("Workers", found["workers"], WORKER_COLUMNS)
+        terminal.print_rows("Workers", [dict(worker) for worker in found["workers"]], WORKER_COLUMNS)
 
 
 def replay(

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 from t6gps.service.config import Config
 from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.ledger import Ledger
+from t6gps.service.pool.state import RunState
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 
@@ -33,13 +34,6 @@ class Purpose(StrEnum):
 
     TRAINING = "episode"
     EVALUATION = "evaluation"
-
-
-class Ending(StrEnum):
-    """How an executor's work ends."""
-
-    DONE = "done"
-    STOPPED = "stopped"
 
 
 class LearnerPort(Protocol):
@@ -118,14 +112,15 @@ class Executor(ABC):
         """Start another learner in the place of one that died; it knows nothing."""
 
     @abstractmethod
-    def close(self, ending: Ending = Ending.STOPPED) -> None:
-        """Stop every worker and the learner, at once. A second call does nothing."""
+    def close(self, outcome: RunState = RunState.STOPPING) -> None:
+        """Stop every worker and the learner, at once; the run is DONE or STOPPING. A second call does nothing."""
 
-    def _open(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: Purpose) -> None:
+    def _open(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: Purpose) -> list[int]:
+        """Note what a batch is for; its episodes that are in quarantine."""
         self._purpose = purpose
         self._snapshots = {snapshot.version: snapshot}
         quarantined = crash_bundle.kept(self.run.bundles, purpose) if self.run else set()
-        self.ledger.open(plans, quarantined.intersection(plan.episode_id for plan in plans))
+        return sorted(quarantined.intersection(plan.episode_id for plan in plans))
 
     def _quarantine(self, plan: EpisodePlan) -> None:
         """Keep what is needed to find out why the episode fails."""

@@ -14,13 +14,15 @@ from typing import Any
 import ray
 
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Ending, Executor, Keep, Purpose
+from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.ray_learner import RayLearner
 from t6gps.service.pool import control
 from t6gps.service.pool.attempt import policy_digest, settings_digest
 from t6gps.service.pool.control import Control
-from t6gps.service.pool.deadlines import TIMINGS, Timings
-from t6gps.service.pool.supervisor import Pool
+from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes, Timings
+from t6gps.service.pool.decision_log import DecisionLog
+from t6gps.service.pool.pool import Pool
+from t6gps.service.pool.state import PoolState, RunState
 from t6gps.service.ray_backend import cluster
 from t6gps.service.ray_backend.transport import RayTransport, SharedEpisode
 from t6gps.service.ray_backend.worker_actor import MakeWorker
@@ -46,16 +48,16 @@ class RayExecutor(Executor):
         super().__init__(config, run)
         most = cluster.join_or_start(config)
         self.transport = RayTransport(make_worker, config.rollout, config.run.cpus_per_worker, timings)
-        self.pool = Pool(
-            self.transport,
-            self.ledger,
+        state = PoolState(
             config.run.workers,
             settings_digest(config.rollout.model_dump_json()),
-            Control(run, most),
-            self._quarantine,
-            autoscale=config.run.autoscale,
-            timings=timings,
+            self.ledger,
+            timings,
+            EpisodeTimes(timings.shortest_episode_s),
+            config.run.autoscale,
         )
+        log = None if run is None else DecisionLog(run.pool)
+        self.pool = Pool(state, self.transport, Control(run, most), self._quarantine, log)
         self._learner: RayLearner | None = None
         self._keep_ahead: Keep | None = None
         self.tend()
@@ -82,9 +84,9 @@ class RayExecutor(Executor):
 
     def _begin(self, plans: Sequence[EpisodePlan], snapshot: PolicySnapshot, purpose: Purpose) -> None:
         self._keep_ahead = None
-        self._open(plans, snapshot, purpose)
+        quarantined = self._open(plans, snapshot, purpose)
         self.transport.policies.publish(snapshot)
-        self.pool.open({version: policy_digest(held) for version, held in self._snapshots.items()})
+        self.pool.open(plans, quarantined, {snapshot.version: policy_digest(snapshot)})
 
     def feed(self, episode: Episode) -> None:
         assert isinstance(episode, SharedEpisode), "`sample` hands over no others"
@@ -102,13 +104,13 @@ class RayExecutor(Executor):
             self._learner.kill()
         self._learner = None
 
-    def close(self, ending: Ending = Ending.STOPPED) -> None:
+    def close(self, outcome: RunState = RunState.STOPPING) -> None:
         if not ray.is_initialized():
             return
         # A second Ctrl-C must not leave half of the processes behind.
         previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
         try:
-            self.pool.close(*(("DONE", "") if ending is Ending.DONE else ("STOPPING", "the run was stopped")))
+            self.pool.close(outcome, "" if outcome is RunState.DONE else "the run was stopped")
         finally:
             ray.shutdown()
             for number, handler in previous.items():

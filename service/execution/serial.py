@@ -7,9 +7,10 @@ from pathlib import Path
 
 from t6gps.learner.learner import Learner
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Ending, Executor, Keep, Purpose
+from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.wiring import new_learner
 from t6gps.service.pool.attempt import Failure, attempt
+from t6gps.service.pool.state import RunState
 from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
@@ -43,7 +44,7 @@ class SerialExecutor(Executor):
         keep: Keep,
         purpose: Purpose = Purpose.TRAINING,
     ) -> None:
-        self._open(plans, snapshot, purpose)
+        self.ledger.open(plans, self._open(plans, snapshot, purpose))
         while (plan := self.ledger.lease(0, 0)) is not None:
             result = attempt(self._worker, plan, snapshot)
             if isinstance(result, Failure):
@@ -72,5 +73,5 @@ class SerialExecutor(Executor):
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)
 
-    def close(self, ending: Ending = Ending.STOPPED) -> None:
+    def close(self, outcome: RunState = RunState.STOPPING) -> None:
         self._worker.close()

@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import traceback
 from dataclasses import dataclass, field
+from enum import StrEnum
 from typing import Any, Protocol
 
 from t6gps.storage.errors import DataError
@@ -12,12 +13,23 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import checked
 
 
+class FailureKind(StrEnum):
+    """How an attempt at an episode fails."""
+
+    RAISED = "raised"
+    """In the worker, as an exception."""
+    CRASH = "crash"
+    """The worker's process ended by a fault of its own."""
+    HANG = "hang"
+    """No result before the deadline."""
+    LOST = "lost"
+    """The process was killed or stopped from outside, or its node is gone: it is not the episode's fault."""
+
+
 @dataclass(frozen=True)
 class Failure:
     """Why an attempt at an episode gave no data.
 
-    kind     "raised" in the worker, "crash" of its process, "hang": no result before its deadline, or "lost": the
-             process was killed or stopped from outside, or its node is gone
     error    type of the exception, or how the process ended
     trace    traceback, or the stacks of a process that hung, as far as they could be had
     step     control step that was being taken, None when unknown
@@ -25,7 +37,7 @@ class Failure:
     log      the end of what the process wrote
     """
 
-    kind: str
+    kind: FailureKind
     error: str
     message: str
     seed: int
@@ -65,7 +77,7 @@ def attempt(worker: Runner, plan: EpisodePlan, snapshot: PolicySnapshot) -> Epis
     except Exception as error:  # whatever a simulator raises, the run goes on
         step, states = worker.position()
         trace = "".join(traceback.format_exception(error))
-        return Failure("raised", type(error).__name__, str(error), plan.seed, step, trace, states)
+        return Failure(FailureKind.RAISED, type(error).__name__, str(error), plan.seed, step, trace, states)
     return episode
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 REMEMBERED_N = 200
 QUANTILE = 0.95
@@ -42,20 +42,22 @@ class Timings:
 TIMINGS = Timings()
 
 
+@dataclass
 class EpisodeTimes:
-    """Times of recent episodes, per control step."""
+    """Times of recent episodes, per control step; no deadline is shorter than `shortest_s`."""
 
-    def __init__(self, shortest_s: float) -> None:
-        self._shortest_s = shortest_s
-        self._per_step_s: deque[float] = deque(maxlen=REMEMBERED_N)
+    shortest_s: float
+    per_step_s: deque[float] = field(default_factory=deque)
 
     def add(self, took_s: float, steps: int) -> None:
         """An episode of `steps` control steps took `took_s`."""
-        self._per_step_s.append(took_s / steps)
+        self.per_step_s.append(took_s / steps)
+        if len(self.per_step_s) > REMEMBERED_N:
+            self.per_step_s.popleft()
 
     def deadline_s(self, steps: int) -> float:
         """An episode of `steps` control steps that takes longer than this hangs."""
-        if not self._per_step_s:
+        if not self.per_step_s:
             return FIRST_S + FIRST_PER_STEP_S * steps
-        ordered = sorted(self._per_step_s)
-        return max(self._shortest_s, FACTOR * ordered[int(QUANTILE * (len(ordered) - 1))] * steps)
+        ordered = sorted(self.per_step_s)
+        return max(self.shortest_s, FACTOR * ordered[int(QUANTILE * (len(ordered) - 1))] * steps)

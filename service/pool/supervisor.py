@@ -1,363 +1,283 @@
-"""The supervisor of a run's workers: one function, `tick`, brings what is towards what is wished.
+"""The supervisor of a run's workers: what to do, given what was observed. It reads no clock and touches no process.
 
-A worker is a slot with an incarnation. However one goes - crash, hang, failed start, lost node, scale-down - it goes by
-`_end`: what it held goes back to the ledger, and the next tick fills the slot again if it is wanted. Slots that keep
-failing wait twice as long each time; when no worker can start at all, the breaker opens and the run ends with the
-reason.
+`decide` is a function of the state, the observations and the time; `pool` carries its instructions out. A worker is a
+slot with an incarnation. However one goes - crash, hang, failed start, lost node, scale-down - it goes by `_end`: what
+it held goes back to the ledger, and the slot is filled again if it is wanted. Slots that keep failing wait twice as
+long each time; when no worker can start at all, the breaker opens and the run ends with the reason.
 """
 
 from __future__ import annotations
 
-import math
-import time
 from collections import deque
-from collections.abc import Callable, Mapping
-from typing import Any
+from collections.abc import Iterator, Sequence
 
-from t6gps.service.pool import control
-from t6gps.service.pool.attempt import Failure
-from t6gps.service.pool.control import Control
-from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes, Timings
-from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.transport import Alive, Died, Done, Handle, Identity, Ready, Report, Transport
-from t6gps.service.pool.workers import Slot, Worker
-from t6gps.storage.errors import RunError
-from t6gps.storage.records import Episode, EpisodePlan
+from t6gps.service.pool import scaling
+from t6gps.service.pool.attempt import Failure, FailureKind
+from t6gps.service.pool.messages import (
+    Accept,
+    Alive,
+    Capacity,
+    Died,
+    Durable,
+    End,
+    Ended,
+    Failed,
+    Instruction,
+    Observation,
+    Opened,
+    Ping,
+    Publish,
+    Quarantine,
+    Ready,
+    Remains,
+    Sampled,
+    ScaleRequested,
+    Send,
+    Start,
+    Unserved,
+)
+from t6gps.service.pool.scaling import PLANS_PER_WORKER
+from t6gps.service.pool.state import Ending, PoolState, RunState, Slot, Worker, WorkerId, WorkerPhase
+from t6gps.storage.records import EpisodePlan
 
-PLANS_PER_WORKER = 2
-BYTES_IN_FLIGHT = 2**30
-"""Episodes under way count with the size of the largest seen."""
 BREAKER_N = 5
 """So many starts in a row that fail, with no worker left, open the breaker."""
 
 
-class Pool:
-    """Keeps `wanted` workers at work on the ledger's plans.
+def decide(state: PoolState, observed: Sequence[Observation], now: float) -> list[Instruction]:
+    """Bring what is towards what is asked for: change `state` by what was observed, and say what to do.
 
-    expected_settings_digest    every worker must have the settings that this stands for
-    quarantine                  keeps a crash bundle; called with a plan whose last attempt has failed
-
-    ticked_s    when the last round began (s, `clock`)
+    The state's condition is FAILED when the run cannot go on: the breaker is open, nothing but failures comes back, or
+    a worker has other settings or another policy than the run.
     """
+    instructions = [instruction for observation in observed for instruction in _observe(state, observation, now)]
+    instructions += scaling.ask_capacity(state, now)
+    scaling.autoscale(state, now)
+    for step in (_end_overdue, _drain, _fill, _send):
+        instructions += step(state, now)
+    before = state.condition, state.reason
+    _judge(state)
+    if (state.condition, state.reason) != before:
+        instructions.append(Publish(state.condition, state.reason))
+    return instructions
 
-    def __init__(
-        self,
-        transport: Transport,
-        ledger: Ledger,
-        wanted: int,
-        expected_settings_digest: str,
-        control_: Control,
-        quarantine: Callable[[EpisodePlan], None],
-        clock: Callable[[], float] = time.monotonic,
-        autoscale: tuple[int, int] | None = None,
-        timings: Timings = TIMINGS,
-    ) -> None:
-        self.ledger = ledger
-        self.wanted = wanted
-        self.state, self.reason = "DEGRADED", "the workers are starting"
-        self.phase = "starting"
-        self._policy_digests: dict[int, str] = {}
-        self.workers: dict[int, Worker] = {}
-        self.ticked_s = -math.inf
-        self.counters = {"started": 0, "crashed": 0, "hung": 0, "drained": 0}
-        self._transport = transport
-        self._digest = expected_settings_digest
-        self._control = control_
-        self._quarantine = quarantine
-        self._clock = clock
-        self._autoscale = autoscale
-        self._by_handle: dict[Handle, Worker] = {}
-        self._slots: dict[int, Slot] = {}
-        self._times = EpisodeTimes(timings.shortest_episode_s)
-        self._timings = timings
-        self._arrived: deque[tuple[int, Episode]] = deque()
-        self._largest_bytes = 1
-        self._failed_starts_n = 0
-        self._last_trouble = ""
-        self._free_n, self._asked_s = 0, -math.inf
-        self._needed_s = -math.inf
-        self._waits: dict[str, float] = {}
 
-    def tick(self, wait_s: float = 0.0) -> None:
-        """One round: hear, judge, replace, start, drain, send, tell. Waits up to `wait_s` for news.
+def _observe(state: PoolState, observation: Observation, now: float) -> Iterator[Instruction]:
+    match observation:
+        case Opened():
+            state.policy_digests = dict(observation.policy_digests)
+            state.ledger.open(observation.plans, observation.quarantined)
+        case Durable():
+            state.ledger.commit(observation.episode_id)
+        case Capacity():
+            state.free_n = observation.free_n
+            for each in state.workers.values():
+                each.placed = each.id not in observation.waiting
+        case ScaleRequested():
+            state.wanted, state.autoscale = observation.workers, None  # scaled by hand: it stays so
+        case Ended():
+            yield from _on_ended(state, observation.worker, observation.remains)
+        case _:
+            worker = state.worker(observation.worker)
+            if worker is not None:
+                yield from _on_report(state, worker, observation, now)
 
-        Raises RunError when the run cannot go on: the breaker is open, nothing but failures comes back, or a worker
-        has other settings or another policy than the run.
-        """
-        for report in self._transport.poll(0.0):
-            self._hear(report)
-        now = self.ticked_s = self._clock()
-        self._scale(now)
-        self._replace_hung(now)
-        self._drain(now)
-        self._fill(now)
-        self._send(now)
-        self._judge()
-        self._tell(now)
-        if self.state == "FAILED":
-            self._control.publish(self.status(now))
-            raise RunError(self.reason)
-        if wait_s > 0:
-            for report in self._transport.poll(wait_s):
-                self._hear(report)
 
-    def open(self, policy_digests: Mapping[int, str]) -> None:
-        """A new book was opened; by version, the policies that its plans name."""
-        self._policy_digests = dict(policy_digests)
-        self._arrived.clear()
-        self.phase = "sampling"
-
-    def sample(self, keep: Callable[[Episode], None]) -> None:
-        """Let the workers run the batch until no episode is missing; see `deliver` for `keep`."""
-        while self.ledger.backlog:
-            self.tick(0.0 if self._arrived else control.TICK_S)
-            self.deliver(keep)
-        if self.ledger.hopeless:
-            self.tick()
-
-    def deliver(self, keep: Callable[[Episode], None]) -> None:
-        """Hand over the episodes that are there; when `keep` returns, one is durable."""
-        while self._arrived:
-            episode_id, episode = self._arrived.popleft()
-            keep(episode)
-            self.ledger.commit(episode_id)
-
-    def close(self, state: str, reason: str) -> None:
-        """End every worker and say how the run ended."""
-        for worker in list(self.workers.values()):
-            self._transport.kill(worker.handle)
-        self.workers.clear()
-        self._by_handle.clear()
-        if self.state != "FAILED":
-            self.state, self.reason = state, reason
-        self._control.publish(self.status(self._clock()))
-
-    def _hear(self, report: Report) -> None:
-        worker = self._by_handle.get(report.handle)
-        if worker is None:
-            return
-        now = self._clock()
-        if isinstance(report, Ready):
-            self._greet(worker, report.identity, now)
-        elif isinstance(report, Alive):
+def _on_report(state: PoolState, worker: Worker, report: Observation, now: float) -> Iterator[Instruction]:
+    match report:
+        case Ready():
+            if report.identity.settings_digest != state.settings_digest:
+                why = "has other settings than the run; install the same version on every node"
+                _fail(state, f"worker {worker.id} {why}")
+                return
+            worker.identity, worker.since_s = report.identity, now
+            worker.enter(WorkerPhase.IDLE)
+            state.failed_starts_n = 0
+        case Alive():
             worker.answered = True
-        elif isinstance(report, Died):
-            self._end(worker, now, "crash", report.error, report.message)
-        else:
-            self._take(worker, report, now)
-
-    def _greet(self, worker: Worker, identity: Identity, now: float) -> None:
-        if identity.settings_digest != self._digest:
-            self._fail(f"worker {worker} has other settings than the run; install the same version on every node")
-            return
-        worker.identity, worker.phase, worker.since_s = identity, "idle", now
-        self._failed_starts_n = 0
-
-    def _take(self, worker: Worker, done: Done, now: float) -> None:
-        if not self._acted_as_planned(worker, done):
-            return
-        if done.plan in worker.plans:
-            worker.plans.remove(done.plan)
-        took_s = now - worker.since_s
-        self._begin(worker, now)
-        if isinstance(done.result, Failure):
-            self._failed(done.plan, done.result)
-        elif done.result is None:
-            self.ledger.give_back(worker.slot, worker.incarnation)
+        case Died():
+            yield _end(state, worker, now, Ending.CRASH, report.error, report.message)
+        case Unserved():
+            _on_result(state, worker, report.plan, now)
+            state.ledger.give_back(*worker.id)
             worker.plans.clear()
-        else:
-            self._times.add(took_s, done.plan.steps)
-            self._slots[worker.slot].failures_n = 0
-            self._largest_bytes = max(self._largest_bytes, done.result.nbytes)
-            if self.ledger.arrive(done.plan):
-                self._arrived.append((done.plan.episode_id, done.result))
+            _begin_episode(state, worker, now)
+        case Failed() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
+            _on_result(state, worker, report.plan, now)
+            yield from _record_failure(state, report.plan, report.failure)
+        case Sampled() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
+            state.times.add(_on_result(state, worker, report.plan, now), report.plan.steps)
+            state.slots[worker.id.slot].failures_n = 0
+            state.largest_bytes = max(state.largest_bytes, report.nbytes)
+            if state.ledger.arrive(report.plan):
+                yield Accept(worker.id, report.plan.episode_id)
 
-    def _acted_as_planned(self, worker: Worker, done: Done) -> bool:
-        expected = self._policy_digests.get(done.plan.policy_version, done.policy_digest)
-        if done.result is None or done.policy_digest == expected:
-            return True
-        self._fail(
-            f"worker {worker} acted with another policy than version {done.plan.policy_version} of the run; "
-            "its data are not kept: go on with --resume, and report this"
-        )
-        return False
 
-    def _begin(self, worker: Worker, now: float) -> None:
-        """The worker comes to the first of its plans."""
-        worker.phase, worker.since_s, worker.answered = ("sampling" if worker.plans else "idle"), now, True
-        worker.deadline_s = math.inf
-        if worker.plans:
-            plan = worker.plans[0]
-            worker.deadline_s = now + self._times.deadline_s(plan.steps) * 2 ** self.ledger.hangs_n(plan)
+def _on_result(state: PoolState, worker: Worker, plan: EpisodePlan, now: float) -> float:
+    """A worker is done with a plan and comes to the next; how long it took (s)."""
+    took_s = now - worker.since_s
+    if plan in worker.plans:
+        worker.plans.remove(plan)
+    _begin_episode(state, worker, now)
+    return took_s
 
-    def _failed(self, plan: EpisodePlan, failure: Failure) -> None:
-        self._last_trouble = f"episode {plan.episode_id}: {failure}"
-        if self.ledger.fail(plan, failure):
-            self._quarantine(plan)
 
-    def _end(self, worker: Worker, now: float, kind: str, error: str, message: str) -> None:
-        """The one way in which a worker goes, planned ("drained") or not ("crash", "hang")."""
-        del self.workers[worker.slot], self._by_handle[worker.handle]
-        if kind != "drained":
-            self._mourn(worker, now, kind, error, message)
-        self.counters[{"crash": "crashed", "hang": "hung", "drained": "drained"}[kind]] += 1
-        self._transport.kill(worker.handle)
-        self.ledger.give_back(worker.slot, worker.incarnation)
+def _begin_episode(state: PoolState, worker: Worker, now: float) -> None:
+    """The worker comes to the first of its plans, if it has one."""
+    worker.since_s, worker.answered, worker.deadline_s = now, True, None
+    if not worker.plans:
+        worker.enter(WorkerPhase.IDLE)
+        return
+    if worker.phase is WorkerPhase.IDLE:
+        worker.enter(WorkerPhase.SAMPLING)
+    plan = worker.plans[0]
+    worker.deadline_s = now + state.times.deadline_s(plan.steps) * 2 ** state.ledger.hangs_n(plan)
 
-    def _mourn(self, worker: Worker, now: float, kind: str, error: str, message: str) -> None:
-        self._slots[worker.slot].failed(now)
-        self._last_trouble = f"worker {worker}: {error}: {message}"
-        if worker.phase == "starting":
-            self._failed_starts_n += 1
-        remains = self._transport.examine(worker.handle)
-        if worker.plans:
-            plan = worker.plans[0]
-            where = f"{worker}" + (f", process {worker.identity.pid}" if worker.identity else "")
-            kind = "lost" if remains.blameless else kind
-            failure = Failure(kind, error, message, plan.seed, None, remains.stacks, [], where, remains.log)
-            self._failed(plan, failure)
 
-    def _replace_hung(self, now: float) -> None:
-        for worker in list(self.workers.values()):
-            for_s, silent_s = now - worker.since_s, now - max(worker.pinged_s, worker.since_s)
-            if now > worker.deadline_s:
-                self._end(worker, now, "hang", "Hang", f"no result within {for_s:.1f} s")
-            elif worker.phase == "starting" and for_s > self._timings.start_s and not self._pending(worker):
-                self._end(worker, now, "hang", "Hang", f"not ready {for_s:.1f} s after its start")
-            elif worker.phase == "idle" and not worker.answered and silent_s > self._timings.ping_deadline_s:
-                self._end(worker, now, "hang", "Hang", f"no sign of life for {silent_s:.1f} s")
-            elif worker.phase == "idle" and worker.answered and silent_s > self._timings.ping_s:
-                self._transport.ping(worker.handle)
+def _acted_as_planned(state: PoolState, worker: Worker, plan: EpisodePlan, policy_digest: str) -> bool:
+    if policy_digest == state.policy_digests.get(plan.policy_version, policy_digest):
+        return True
+    _fail(
+        state,
+        f"worker {worker.id} acted with another policy than version {plan.policy_version} of the run; "
+        "its data are not kept: go on with --resume, and report this",
+    )
+    return False
+
+
+def _record_failure(state: PoolState, plan: EpisodePlan, failure: Failure) -> Iterator[Instruction]:
+    state.last_trouble = f"episode {plan.episode_id}: {failure}"
+    if state.ledger.fail(plan, failure):
+        yield Quarantine(plan)
+
+
+def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str = "", message: str = "") -> End:
+    """The one way in which a worker goes, planned (drained) or not."""
+    if why is not Ending.DRAINED:
+        state.slots[worker.id.slot].failed(now)
+        state.last_trouble = f"worker {worker.id}: {error}: {message}"
+        state.failed_starts_n += worker.phase is WorkerPhase.STARTING
+    state.counters[why] += 1
+    worker.ending = why, error, message
+    worker.enter(WorkerPhase.ENDING)
+    return End(worker.id, why)
+
+
+def _on_ended(state: PoolState, worker_id: WorkerId, remains: Remains) -> Iterator[Instruction]:
+    """The worker is gone: blame the episode in hand if it is at fault, and give back the others."""
+    worker = state.workers.pop(worker_id.slot)
+    assert worker.id == worker_id and worker.ending is not None, "only a worker that is to end is ended"
+    why, error, message = worker.ending
+    if why is not Ending.DRAINED and worker.plans:
+        plan = worker.plans[0]
+        kind = FailureKind.HANG if why is Ending.HANG else FailureKind.CRASH
+        kind = FailureKind.LOST if remains.blameless else kind
+        where = f"{worker.id}" + (f", process {worker.identity.pid}" if worker.identity else "")
+        failure = Failure(kind, error, message, plan.seed, None, remains.stacks, [], where, remains.log)
+        yield from _record_failure(state, plan, failure)
+    state.ledger.give_back(*worker_id)
+
+
+def _end_overdue(state: PoolState, now: float) -> Iterator[Instruction]:
+    """Workers that hang by their deadline, and the question for a sign of life to those that are idle."""
+    timings = state.timings
+    for worker in state.workers.values():
+        for_s, pinged_s = now - worker.since_s, max(worker.pinged_s or worker.since_s, worker.since_s)
+        silent_s = now - pinged_s
+        if worker.phase is WorkerPhase.ENDING:
+            continue
+        if worker.deadline_s is not None and now > worker.deadline_s:
+            yield _end(state, worker, now, Ending.HANG, "Hang", f"no result within {for_s:.1f} s")
+        elif worker.phase is WorkerPhase.STARTING:
+            if for_s > timings.start_s and not scaling.pending(state, worker):
+                yield _end(state, worker, now, Ending.HANG, "Hang", f"not ready {for_s:.1f} s after its start")
+        elif worker.phase is WorkerPhase.IDLE:
+            if not worker.answered and silent_s > timings.ping_deadline_s:
+                yield _end(state, worker, now, Ending.HANG, "Hang", f"no sign of life for {silent_s:.1f} s")
+            elif worker.answered and silent_s > timings.ping_s:
                 worker.pinged_s, worker.answered = now, False
+                yield Ping(worker.id)
 
-    def _pending(self, worker: Worker) -> bool:
-        """True while a worker waits for a CPU."""
-        return worker.phase == "starting" and not worker.placed and self._free_n < 1
 
-    def _scale(self, now: float) -> None:
-        starting = [worker for worker in self.workers.values() if worker.phase == "starting"]
-        if (starting or self._autoscale) and now - self._asked_s >= self._timings.capacity_s:
-            self._free_n, self._asked_s = self._transport.free_workers(), now
-            for worker in starting:
-                fresh = now - worker.since_s < self._timings.pending_after_s
-                worker.placed = fresh or self._transport.placed(worker.handle)
-        wish = self._control.wish()
-        if wish is not None:
-            self.wanted, self._autoscale = wish, None  # scaled by hand: it stays so
-        if self._autoscale is None:
-            return
-        least, most = self._autoscale
-        room = sum(not self._pending(worker) for worker in self.workers.values()) + max(self._free_n, 0)
-        useful = min(most, max(least, min(room, math.ceil(self.ledger.backlog / PLANS_PER_WORKER))))
-        if useful >= self.wanted:
-            self.wanted, self._needed_s = useful, now
-        elif now - self._needed_s > self._timings.shrink_after_s:
-            self.wanted = useful
+def _drain(state: PoolState, now: float) -> Iterator[Instruction]:
+    """Workers too many finish the episode in hand; others get their next one."""
+    for worker in state.workers.values():
+        if worker.phase is WorkerPhase.ENDING:
+            continue
+        if worker.id.slot < state.wanted:
+            if worker.phase is WorkerPhase.DRAINING:
+                worker.enter(WorkerPhase.SAMPLING)
+            continue
+        in_hand = worker.plans[0] if worker.plans else None
+        if in_hand is None or in_hand.episode_id not in state.ledger.leases:
+            yield _end(state, worker, now, Ending.DRAINED)
+            continue
+        worker.enter(WorkerPhase.DRAINING)
+        if len(worker.plans) > 1:  # this worker is gone before it comes to them
+            state.ledger.give_back(*worker.id, keep=in_hand.episode_id)
+            worker.plans = deque([in_hand])
 
-    def _drain(self, now: float) -> None:
-        for worker in list(self.workers.values()):
-            worker.draining = worker.slot >= self.wanted
-            if not worker.draining:
+
+def _fill(state: PoolState, now: float) -> Iterator[Instruction]:
+    for number in range(state.wanted):
+        slot = state.slots.setdefault(number, Slot())
+        if number in state.workers or (slot.retry_s is not None and slot.retry_s > now):
+            continue
+        slot.incarnations_n += 1
+        worker = WorkerId(number, slot.incarnations_n)
+        state.workers[number] = Worker(worker, now)
+        state.free_n -= 1
+        state.counters["started"] += 1
+        yield Start(worker)
+
+
+def _send(state: PoolState, now: float) -> Iterator[Instruction]:
+    for _ in range(PLANS_PER_WORKER):
+        for worker in state.workers.values():
+            if not worker.ready or len(worker.plans) >= PLANS_PER_WORKER or not _credit(state):
                 continue
-            head = worker.plans[0] if worker.plans else None
-            if head is None or head.episode_id not in self.ledger.leases:
-                self._end(worker, now, "drained", "", "")
-            elif len(worker.plans) > 1:  # the other plans go to others now; this worker is gone before it comes to them
-                self.ledger.give_back(worker.slot, worker.incarnation, keep=head.episode_id)
-                worker.plans = deque([head])
+            plan = state.ledger.lease(*worker.id)
+            if plan is None:
+                return
+            worker.plans.append(plan)
+            if len(worker.plans) == 1:
+                _begin_episode(state, worker, now)
+            yield Send(worker.id, plan)
 
-    def _fill(self, now: float) -> None:
-        for number in range(self.wanted):
-            slot = self._slots.setdefault(number, Slot())
-            if number in self.workers or slot.retry_s > now:
-                continue
-            slot.incarnations_n += 1
-            handle = self._transport.start(number, slot.incarnations_n)
-            self.workers[number] = self._by_handle[handle] = Worker(number, slot.incarnations_n, handle, now)
-            self._free_n -= 1
-            self.counters["started"] += 1
 
-    def _send(self, now: float) -> None:
-        for _ in range(PLANS_PER_WORKER):
-            for worker in self.workers.values():
-                busy = worker.phase == "starting" or worker.draining or len(worker.plans) >= PLANS_PER_WORKER
-                if busy or not self._credit():
-                    continue
-                plan = self.ledger.lease(worker.slot, worker.incarnation)
-                if plan is None:
-                    return
-                worker.plans.append(plan)
-                self._transport.send(worker.handle, plan)
-                if len(worker.plans) == 1:
-                    self._begin(worker, now)
+def _credit(state: PoolState) -> bool:
+    """True while another episode may be under way: what has arrived and is not durable yet counts."""
+    under_way = len(state.ledger.leases) + state.ledger.arrived
+    most_bytes_n = max(state.bytes_in_flight // state.largest_bytes, 1)
+    return under_way < min(PLANS_PER_WORKER * max(len(state.workers), 1), most_bytes_n)
 
-    def _credit(self) -> bool:
-        """True while another episode may be under way: what has arrived and is not durable yet counts."""
-        under_way = len(self.ledger.leases) + self.ledger.arrived
-        most = min(PLANS_PER_WORKER * max(len(self.workers), 1), max(BYTES_IN_FLIGHT // self._largest_bytes, 1))
-        return under_way < most
 
-    def _judge(self) -> None:
-        """State and reason, in words."""
-        if self.state == "FAILED":
-            return
-        ready = [worker for worker in self.workers.values() if worker.phase != "starting"]
-        pending = [worker for worker in self.workers.values() if self._pending(worker)]
-        if self.ledger.hopeless:
-            self._fail(f"nothing but failures comes back; the last: {self._last_trouble}; replay its bundle")
-        elif self._failed_starts_n >= BREAKER_N and not ready:
-            self._fail(
-                f"{self._failed_starts_n} workers in a row could not start; the last: {self._last_trouble}; "
-                "mend the cause, then go on with --resume"
-            )
-        elif self.wanted == 0:
-            self.state, self.reason = "PAUSED", "scaled to no workers; scale up to go on"
-        elif len(ready) >= self.wanted:
-            self.state, self.reason = "RUNNING", ""
-        elif pending:
-            self.state = "DEGRADED"
-            self.reason = (
-                f"{len(ready)} of {self.wanted} workers: {len(pending)} wait for a CPU, and none is free; "
-                f"add a node, or scale to {len(ready)}"
-            )
-        else:
-            trouble = f"; the last trouble: {self._last_trouble}" if self._last_trouble else ""
-            self.state = "DEGRADED"
-            self.reason = f"{len(ready)} of {self.wanted} workers: the others are starting{trouble}"
+def _judge(state: PoolState) -> None:
+    """Condition and reason, in words."""
+    if state.condition is RunState.FAILED:
+        return
+    ready_n = sum(worker.phase not in (WorkerPhase.STARTING, WorkerPhase.ENDING) for worker in state.workers.values())
+    pending_n = sum(scaling.pending(state, worker) for worker in state.workers.values())
+    few = f"{ready_n} of {state.wanted} workers"
+    if state.ledger.hopeless:
+        _fail(state, f"nothing but failures comes back; the last: {state.last_trouble}; replay its bundle")
+    elif state.failed_starts_n >= BREAKER_N and not ready_n:
+        _fail(
+            state,
+            f"{state.failed_starts_n} workers in a row could not start; the last: {state.last_trouble}; "
+            "mend the cause, then go on with --resume",
+        )
+    elif state.wanted == 0:
+        state.turn(RunState.PAUSED, "scaled to no workers; scale up to go on")
+    elif ready_n >= state.wanted:
+        state.turn(RunState.RUNNING, "")
+    elif pending_n:
+        remedy = f"add a node, or scale to {ready_n}"
+        state.turn(RunState.DEGRADED, f"{few}: {pending_n} wait for a CPU, and none is free; {remedy}")
+    else:
+        trouble = f"; the last trouble: {state.last_trouble}" if state.last_trouble else ""
+        state.turn(RunState.DEGRADED, f"{few}: the others are starting{trouble}")
 
-    def _fail(self, reason: str) -> None:
-        self.state, self.reason = "FAILED", reason
 
-    def _tell(self, now: float) -> None:
-        if self._control.due(now, self.state):
-            self._control.publish(self.status(now))
-
-    def wait(self, who: str, whom: str, begins: bool) -> None:
-        """Note that somebody begins or ends to wait for somebody."""
-        if begins:
-            self._waits.setdefault(f"{who} waits for {whom}", self._clock())
-        else:
-            self._waits.pop(f"{who} waits for {whom}", None)
-
-    def status(self, now: float) -> dict[str, Any]:
-        """Everything that `t6gps status` shows; ages in seconds."""
-        idle_s = [now - worker.since_s for worker in self.workers.values() if worker.phase == "idle"]
-        waits = [{"what": what, "for_s": round(now - since_s, 3)} for what, since_s in self._waits.items()]
-        if idle_s and not self.ledger.waiting:
-            waits.append({"what": f"{len(idle_s)} workers wait for plans", "for_s": round(min(idle_s), 3)})
-        return {
-            "state": self.state,
-            "reason": self.reason,
-            "phase": self.phase,
-            "wanted": self.wanted,
-            "ready": sum(worker.phase != "starting" and not worker.draining for worker in self.workers.values()),
-            "workers": [worker.status(now) for worker in self.workers.values()],
-            "backlog": self.ledger.backlog,
-            "leases": len(self.ledger.leases),
-            "arrived": self.ledger.arrived,
-            "bytes_in_flight": (len(self.ledger.leases) + self.ledger.arrived) * self._largest_bytes,
-            "waits": waits,
-            "quarantined": sorted(self.ledger.quarantined),
-            "episodes": dict(self.ledger.counters),
-            "processes": dict(self.counters),
-        }
+def _fail(state: PoolState, reason: str) -> None:
+    state.turn(RunState.FAILED, reason)

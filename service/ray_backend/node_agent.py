@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from pathlib import Path
 
-from t6gps.service.pool.transport import Remains
+from t6gps.service.pool.messages import Remains
 from t6gps.service.ray_backend import private, processes
 from t6gps.service.ray_backend.processes import Process
 

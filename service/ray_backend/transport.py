@@ -16,7 +16,9 @@ import ray
 
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.deadlines import Timings
-from t6gps.service.pool.transport import Alive, Died, Done, Ready, Remains, Report, Transport
+from t6gps.service.pool.messages import Alive, Died, Ready, Remains
+from t6gps.service.pool.state import WorkerId
+from t6gps.service.pool.transport import Done, Report, Transport
 from t6gps.service.ray_backend import cluster, node_agent, private, processes
 from t6gps.service.ray_backend.cluster import start_actor
 from t6gps.service.ray_backend.node_agent import NodeAgentActor
@@ -37,22 +39,25 @@ class SharedEpisode(Episode):
     reference: Any = None
 
 
+@dataclass
 class Remote:
-    """A worker as the transport knows it: its actor, and its process once it is ready."""
+    """A worker as the transport knows it: its actor, and its process and node once it is ready.
 
-    def __init__(self, actor: Any) -> None:
-        self.actor = actor
-        self.process: Process | None = None
-        self.node = ""
-        self.died = False
-        self.exited = False  # it died by leaving, as Ray has seen, or for want of memory
+    exited   it died by leaving, as Ray has seen, or for want of memory
+    """
+
+    actor: Any
+    process: Process | None = None
+    node: str = ""
+    died: bool = False
+    exited: bool = False
 
 
 @dataclass(frozen=True)
 class Call:
-    """A call of an actor: `plan` where it runs one."""
+    """A call of a worker's actor: `plan` where it runs one."""
 
-    remote: Remote
+    worker: WorkerId
     reference: Any
     plan: EpisodePlan | None = None
 
@@ -70,24 +75,26 @@ class RayTransport(Transport):
         self._timings = timings
         self._node, self._logs = cluster.this_node(), private.logs_folder()
         self._agents: dict[str, Any] = {}
-        self._remotes: set[Remote] = set()
+        self._remotes: dict[WorkerId, Remote] = {}
         self._over: SimpleQueue[tuple[Call, Future[Any]]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
 
-    def start(self, slot: int, incarnation: int) -> Remote:
-        remote = Remote(start_actor(WorkerActor, cpus=self._cpus))
-        self._await(Call(remote, remote.actor.open.remote(self._make_worker, self._settings)))
-        return remote
+    def start(self, worker: WorkerId) -> None:
+        actor = start_actor(WorkerActor, cpus=self._cpus)
+        self._begin(worker, Remote(actor), actor.open.remote(self._make_worker, self._settings))
 
-    def send(self, handle: Remote, plan: EpisodePlan) -> None:
-        run = handle.actor.run.remote(plan, self.policies.source, self._timings.policy_answer_s)
-        self._await(Call(handle, run, plan))
+    def _begin(self, worker: WorkerId, remote: Remote, opened: Any) -> None:
+        self._remotes[worker] = remote
+        self._await(Call(worker, opened))
 
-    def ping(self, handle: Remote) -> None:
-        self._await(Call(handle, handle.actor.ping.remote()))
+    def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
+        run = self._remotes[worker].actor.run.remote(plan, self.policies.source, self._timings.policy_answer_s)
+        self._await(Call(worker, run, plan))
+
+    def ping(self, worker: WorkerId) -> None:
+        self._await(Call(worker, self._remotes[worker].actor.ping.remote()))
 
     def _await(self, call: Call) -> None:
-        self._remotes.add(call.remote)
         call.reference.future().add_done_callback(lambda future: self._over.put((call, future)))
 
     def poll(self, wait_s: float) -> list[Report]:
@@ -98,30 +105,31 @@ class RayTransport(Transport):
             while True:
                 over.append(self._over.get_nowait())
         except Empty:
-            return [self._report(call, future) for call, future in over if call.remote in self._remotes]
+            return [self._report(call, future) for call, future in over if call.worker in self._remotes]
 
     def _report(self, call: Call, future: Future[Any]) -> Report:
+        worker, remote = call.worker, self._remotes[call.worker]
         try:
             result = future.result()
         except ray.exceptions.RayTaskError as error:
             cause = error.cause if isinstance(error.cause, Exception) else error
-            return Died(call.remote, type(cause).__name__, str(cause))
+            return Died(worker, type(cause).__name__, str(cause))
         except ray.exceptions.RayError as error:
             how = _how(error)
             memory = isinstance(error, ray.exceptions.OutOfMemoryError)
-            call.remote.died, call.remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
-            return Died(call.remote, type(error).__name__, how)
+            remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
+            return Died(worker, type(error).__name__, how)
         if isinstance(result, Answer):
             return self._done(call, result)
         if isinstance(result, Greeting):
-            return self._ready(call.remote, result)
-        return Alive(call.remote)
+            return self._ready(worker, remote, result)
+        return Alive(worker)
 
-    def _ready(self, remote: Remote, greeting: Greeting) -> Ready:
-        remote.process, remote.node = greeting.process, greeting.node
+    def _ready(self, worker: WorkerId, remote: Remote, greeting: Greeting) -> Ready:
+        remote.process, remote.node = greeting.process, greeting.identity.node_id
         if remote.node != self._node and remote.node not in self._agents:
             self._agents[remote.node] = start_actor(NodeAgentActor, where=remote.node)
-        return Ready(remote, greeting.identity)
+        return Ready(worker, greeting.identity)
 
     def _done(self, call: Call, answer: Answer) -> Done:
         assert call.plan is not None, "only plans have answers"
@@ -131,16 +139,17 @@ class RayTransport(Transport):
             result = SharedEpisode(frames, summary, answer.packed, call.reference)
         elif answer.silent_server is not None:
             self.policies.missed(answer.silent_server)
-        return Done(call.remote, call.plan, result, answer.policy_digest)
+        return Done(call.worker, call.plan, result, answer.policy_digest)
 
-    def examine(self, handle: Remote) -> Remains:
-        if handle.process is None:
+    def examine(self, worker: WorkerId) -> Remains:
+        remote = self._remotes[worker]
+        if remote.process is None:
             return Remains("the process was never ready")
-        if handle.node == self._node:
-            remains = node_agent.remains(handle.process, self._logs, handle.died)
+        if remote.node == self._node:
+            remains = node_agent.remains(remote.process, self._logs, remote.died)
         else:
-            remains = self._examine_there(handle.process, handle.node, handle.died)
-        return replace(remains, blameless=remains.blameless and not handle.exited)
+            remains = self._examine_there(remote.process, remote.node, remote.died)
+        return replace(remains, blameless=remains.blameless and not remote.exited)
 
     def _examine_there(self, process: Process, node: str, died: bool) -> Remains:
         if node in self._agents:
@@ -154,16 +163,16 @@ class RayTransport(Transport):
                 _log.info("the agent of node %s does not answer: %s", node, type(error).__name__)
         return Remains(f"its node does not answer ({node})", blameless=True)
 
-    def kill(self, handle: Remote) -> None:
-        ray.kill(handle.actor)
-        if handle.process is not None and handle.node == self._node:
-            processes.kill(handle.process)  # a stopped process does not hear Ray
-        elif handle.node in self._agents:
-            self._agents[handle.node].kill.remote(handle.process)
-        self._remotes.discard(handle)
+    def kill(self, worker: WorkerId) -> None:
+        remote = self._remotes.pop(worker)
+        ray.kill(remote.actor)
+        if remote.process is not None and remote.node == self._node:
+            processes.kill(remote.process)  # a stopped process does not hear Ray
+        elif remote.node in self._agents:
+            self._agents[remote.node].kill.remote(remote.process)
 
-    def placed(self, handle: Remote) -> bool:
-        return private.is_placed(handle.actor)
+    def placed(self, worker: WorkerId) -> bool:
+        return private.is_placed(self._remotes[worker].actor)
 
     def free_workers(self) -> int:
         return cluster.free_workers(self._cpus)

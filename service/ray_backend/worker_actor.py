@@ -11,7 +11,7 @@ import pyarrow as pa
 import ray
 
 from t6gps.service.pool.attempt import Failure, Runner, attempt, policy_digest, settings_digest
-from t6gps.service.pool.transport import Identity
+from t6gps.service.pool.state import Identity
 from t6gps.service.ray_backend import cluster, processes
 from t6gps.service.ray_backend.policy_server import PolicySource
 from t6gps.service.ray_backend.processes import Process
@@ -27,11 +27,10 @@ VAIN_PULL_S = 0.2
 
 @dataclass(frozen=True)
 class Greeting:
-    """Who a worker is, its process, and its node in Ray's words."""
+    """Who a worker is, and its process."""
 
     identity: Identity
     process: Process | None
-    node: str
 
 
 @dataclass(frozen=True)
@@ -61,8 +60,8 @@ class WorkerActor:
         """Make the worker."""
         self._worker = make_worker(settings)
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
-        identity = Identity(os.getpid(), address, settings_digest(settings.model_dump_json()))
-        return Greeting(identity, self._process, cluster.this_node())
+        digest = settings_digest(settings.model_dump_json())
+        return Greeting(Identity(os.getpid(), address, cluster.this_node(), digest), self._process)
 
     def ping(self) -> None:
         """A sign of life."""

@@ -11,7 +11,8 @@ from typing import TYPE_CHECKING
 
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import Ending, Executor
+from t6gps.service.execution.executor import Executor
+from t6gps.service.pool.state import RunState
 from t6gps.service.training import evaluation, loop
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.views import terminal
@@ -86,7 +87,7 @@ def complete(config: Config, this: Run, serial: bool) -> tuple[Evaluation, list[
             with terminal.ProgressDisplay(config.run.iterations) as progress:
                 loop.train(config, this, executor, progress)
             result = evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
-            executor.close(Ending.DONE)
+            executor.close(RunState.DONE)
         _heed_sigterm()
         evaluation.keep(this, result)
         return result, run_figures.draw(this, config.terrain)

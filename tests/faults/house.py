@@ -18,7 +18,7 @@ from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.deadlines import Timings
-from t6gps.service.pool.workers import Worker
+from t6gps.service.pool.state import RunState, Worker
 from t6gps.service.ray_backend import cluster
 from t6gps.storage import catalog, schema
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -117,13 +117,13 @@ class House:
 
     @property
     def workers(self) -> list[Worker]:
-        return list(self.executor.pool.workers.values())
+        return list(self.executor.pool.state.workers.values())
 
     def ready(self, n: int) -> bool:
         """Tick; True when there are n workers and all are ready."""
         pool = self.executor.pool
         pool.tick(0.02)
-        return len(self.workers) == n and pool.state == "RUNNING"
+        return len(self.workers) == n and pool.state.condition is RunState.RUNNING
 
     def check(self, found: list[Episode], without: tuple[int, ...] = ()) -> None:
         """Every planned episode is there once, and it is what the plan alone makes of it."""

@@ -19,7 +19,7 @@ from house import QUICK, House, add_node, others, pid, three_nodes
 from ray.cluster_utils import Cluster
 
 from t6gps.service.pool import control
-from t6gps.service.pool.workers import Worker
+from t6gps.service.pool.state import Worker
 from t6gps.service.ray_backend import cluster
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
@@ -54,7 +54,8 @@ def house(everything: House, wait_until: Callable[..., None]) -> House:
 
 def node_of(worker: Worker) -> str:
     """The node of a worker that is ready, in Ray's words."""
-    name: str = worker.handle.node
+    assert worker.identity is not None
+    name: str = worker.identity.node_id
     return name
 
 
@@ -113,13 +114,13 @@ def test_a_node_that_joins_gets_workers_when_more_are_wished(house: House, nodes
     scaling.start()
     while scaling.is_alive():
         house.check(house.sample())
-        if not joined and "wait for a CPU" in house.executor.pool.reason:
+        if not joined and "wait for a CPU" in house.executor.pool.state.reason:
             add_node(nodes)
             joined = True
     assert answers == [4]
     assert len(nodes_in_use(house)) == len(before) + 1
     house.check(house.sample())
-    house.executor.pool.wanted = 3
+    house.executor.pool.state.wanted = 3
 
 
 def test_t16_a_node_that_dies_takes_no_episode_with_it(
@@ -132,11 +133,11 @@ def test_t16_a_node_that_dies_takes_no_episode_with_it(
         nonlocal slot, incarnation, node
         victim = busy(house, others(nodes))
         if victim is not None and not node:
-            slot, incarnation, node = victim.slot, victim.incarnation, node_of(victim)
+            slot, incarnation, node = *victim.id, node_of(victim)
             nodes.remove_node(others(nodes)[node], allow_graceful=False)
 
     house.check(house.sample(remove))
     assert house.executor.ledger.counters["failures"] == failures_n  # no episode is to blame
     wait_until(lambda: house.ready(3) and node not in nodes_in_use(house), 120)
-    assert house.executor.pool.workers[slot].incarnation > incarnation
+    assert house.executor.pool.state.workers[slot].id.incarnation > incarnation
     house.check(house.sample())

@@ -23,7 +23,7 @@ from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.deadlines import Timings
-from t6gps.service.pool.workers import Worker
+from t6gps.service.pool.state import RunState, Worker, WorkerPhase
 from t6gps.storage import catalog, durable, schema
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.robot.topology import CABLES_N
@@ -55,7 +55,7 @@ class Soak:
 
     @property
     def workers(self) -> dict[int, Worker]:
-        return self.executor.pool.workers
+        return self.executor.pool.state.workers
 
     def episode_came(self) -> None:
         """After every episode: measure, note who is back at work, and do the next fault."""
@@ -71,28 +71,28 @@ class Soak:
             self._do(FAULTS[self.rng.integers(len(FAULTS))], now)
 
     def _is_over(self, fault: str, slot: int, incarnation: int) -> bool:
-        """True when the successor of a killed or stopped worker, or every worker wished for, is at work."""
-        at_work = [worker for worker in self.workers.values() if worker.phase == "sampling" and not worker.draining]
+        """True when the successor of a killed or stopped worker, or every worker requested for, is at work."""
+        at_work = [worker for worker in self.workers.values() if worker.phase is WorkerPhase.SAMPLING]
         if fault == "scale":
-            return len(at_work) == len(self.workers) == self.executor.pool.wanted
-        return any(worker.slot == slot and worker.incarnation > incarnation for worker in at_work)
+            return len(at_work) == len(self.workers) == self.executor.pool.state.wanted
+        return any(worker.id.slot == slot and worker.id.incarnation > incarnation for worker in at_work)
 
     def _do(self, fault: str, now: float) -> None:
-        at_work = [worker for worker in self.workers.values() if worker.phase == "sampling" and worker.identity]
+        at_work = [worker for worker in self.workers.values() if worker.phase is WorkerPhase.SAMPLING]
         if not at_work:
             return
         self.faults[fault] += 1
         if fault == "scale":
-            wish = {"id": str(now), "workers": int(self.rng.integers(1, 4))}
-            path = self.run.pool / "wish.json"
-            durable.hidden(path).write_text(json.dumps(wish))
+            request = {"id": str(now), "workers": int(self.rng.integers(1, 4))}
+            path = self.run.pool / "scale_request.json"
+            durable.hidden(path).write_text(json.dumps(request))
             durable.publish(path)
-            self.executor.pool.tick()  # it has seen the wish
+            self.executor.pool.tick()  # it has seen the request
             self._under_way = fault, -1, -1, now
             return
         victim = at_work[self.rng.integers(len(at_work))]
         assert victim.identity is not None
-        self._under_way = fault, victim.slot, victim.incarnation, now
+        self._under_way = fault, *victim.id, now
         os.kill(victim.identity.pid, signal.SIGKILL if fault == "kill" else signal.SIGSTOP)
 
     def _measure(self, now: float) -> dict[str, float]:
@@ -148,11 +148,12 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
 
     def at_rest() -> bool:
         pool.tick(0.05)
-        return pool.state == "RUNNING" and all(worker.phase == "idle" for worker in soak.workers.values())
+        phases = {worker.phase for worker in soak.workers.values()}
+        return pool.state.condition is RunState.RUNNING and phases == {WorkerPhase.IDLE}
 
     wait_until(at_rest, 60)
     figures = {name: soak.slope_per_min(name) for name in soak.measured[0] if name != "time_min"}
-    kept = {"episodes": committed_n, **soak.faults, **pool.counters}
+    kept = {"episodes": committed_n, **soak.faults, **pool.state.counters}
     waits = {f"{fault}_p95_s": np.quantile(took_s, 0.95) for fault, took_s in soak.took_s.items() if took_s}
     print(json.dumps({"minutes": MINUTES, **kept, **waits, "slopes_per_min": figures}, indent=1, default=float))
     assert ledger.counters["committed"] == committed_n

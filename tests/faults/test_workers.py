@@ -24,7 +24,7 @@ from t6gps.service.config import Config, parse
 from t6gps.service.pool import control, crash_bundle
 from t6gps.service.pool.attempt import policy_digest
 from t6gps.service.pool.ledger import FAILURES_ALLOWED_N
-from t6gps.service.pool.workers import Worker
+from t6gps.service.pool.state import RunState, Worker
 from t6gps.service.ray_backend import processes
 from t6gps.service.ray_backend.policy_server import VERSIONS_HELD_N
 from t6gps.service.ray_backend.processes import Process
@@ -82,7 +82,7 @@ def at_work_on(house: House, number: int) -> list[Worker]:
 
 def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_until: Callable[..., None]) -> None:
     rng = np.random.default_rng(0)
-    crashed_n, quarantined_n = house.executor.pool.counters["crashed"], len(house.executor.ledger.quarantined)
+    crashed_n, quarantined_n = house.executor.pool.state.counters["crashed"], len(house.executor.ledger.quarantined)
     for _ in range(KILLS_N):
         victim = pid(house.workers[rng.integers(2)])
         killing = threading.Timer(rng.uniform(0.0, BOOK_S), os.kill, (victim, signal.SIGKILL))
@@ -90,7 +90,7 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
         house.check(house.sample())
         killing.join()
         wait_until(lambda gone=victim: house.ready(2) and gone not in map(pid, house.workers), 90)
-    assert house.executor.pool.counters["crashed"] == crashed_n + KILLS_N
+    assert house.executor.pool.state.counters["crashed"] == crashed_n + KILLS_N
     assert len(house.executor.ledger.quarantined) == quarantined_n
 
 
@@ -163,7 +163,7 @@ def test_a_worker_that_dies_leaves_how_it_ended_and_its_log(house: House, how: s
 
 
 def test_t4_all_workers_die_at_once_and_the_run_recovers(house: House, wait_until: Callable[..., None]) -> None:
-    crashed_n = house.executor.pool.counters["crashed"]
+    crashed_n = house.executor.pool.state.counters["crashed"]
 
     def kill_all(found: list[Episode]) -> None:
         if len(found) == 5:
@@ -171,19 +171,19 @@ def test_t4_all_workers_die_at_once_and_the_run_recovers(house: House, wait_unti
                 os.kill(pid(worker), signal.SIGKILL)
 
     house.check(house.sample(kill_all))
-    assert house.executor.pool.counters["crashed"] == crashed_n + 2
+    assert house.executor.pool.state.counters["crashed"] == crashed_n + 2
     wait_until(lambda: house.ready(2), 90)
 
 
-def test_t6_scaling_while_sampling_reaches_its_wish_and_loses_nothing(house: House) -> None:
+def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: House) -> None:
     reached: list[int] = []
     failed: list[Exception] = []
 
     def scale() -> None:
         try:
-            for wish in (1, 3, 1, 2):
-                assert control.scale(house.run, wish, 90)["ready"] == wish
-                reached.append(wish)
+            for request in (1, 3, 1, 2):
+                assert control.scale(house.run, request, 90)["ready"] == request
+                reached.append(request)
         except Exception as error:  # told by the main thread
             failed.append(error)
 
@@ -198,12 +198,12 @@ def test_t6_scaling_while_sampling_reaches_its_wish_and_loses_nothing(house: Hou
     assert house.executor.ledger.counters["late"] == 0
 
 
-def test_a_wish_that_is_not_allowed_changes_nothing(house: House) -> None:
+def test_a_request_that_is_not_allowed_changes_nothing(house: House) -> None:
     most = control.status(house.run)["most"]
-    for wish in (-1, most + 1):
+    for request in (-1, most + 1):
         with pytest.raises(RunError, match=f"workers must lie in 0 .. {most}"):
-            control.scale(house.run, wish)
-    assert house.executor.pool.wanted == 2
+            control.scale(house.run, request)
+    assert house.executor.pool.state.wanted == 2
 
 
 def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
@@ -212,7 +212,7 @@ def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch:
         patch.setattr("t6gps.service.execution.ray_executor.policy_digest", lambda _: "another")
         with pytest.raises(RunError, match="acted with another policy"):
             house.sample()
-    house.executor.pool.state = "RUNNING"
+    house.executor.pool.state.turn(RunState.DEGRADED, "")
     house.check(house.sample())
 
 
@@ -274,7 +274,7 @@ def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(ho
         while time.monotonic() < end_s:
             pool.tick(0.05)
             most = max(most, len(ledger.leases) + ledger.arrived)
-            bytes_ = max(bytes_, int(pool.status(time.monotonic())["bytes_in_flight"]))
+            bytes_ = max(bytes_, int(pool.status()["bytes_in_flight"]))
 
     found = house.sample(pause)
     assert most == 4
@@ -332,7 +332,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
         wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 90)  # with the one not kept yet
         status = control.status(house.run)
         assert (status["state"], status["ready"], status["wanted"], status["backlog"]) == ("RUNNING", 2, 2, 30)
-        pids = {(worker.slot, pid(worker)) for worker in house.workers}
+        pids = {(worker.id.slot, pid(worker)) for worker in house.workers}
         assert {(worker["slot"], worker["pid"]) for worker in status["workers"]} == pids
         assert status["bytes_in_flight"] > 0
 

@@ -50,7 +50,7 @@ class Kills(Silent):
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
         if (iteration, phase, done) == self.worker_at and "worker" not in self.done:
             self.done.add("worker")
-            worker = next(worker for worker in self.executor.pool.workers.values() if worker.identity)
+            worker = next(worker for worker in self.executor.pool.state.workers.values() if worker.identity)
             os.kill(worker.identity.pid, signal.SIGKILL)
         if (iteration, phase) == (1, "fit") and "learner" not in self.done:
             self.done.add("learner")
@@ -74,7 +74,7 @@ class Loses(Silent):
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
         if (iteration, phase) == (1, "sample") and not self.lost:
             candidates = others(self.nodes)
-            used = [worker.handle.node for worker in self.executor.pool.workers.values()]
+            used = [worker.identity.node_id for worker in self.executor.pool.state.workers.values() if worker.identity]
             self.lost = next((node for node in used if node in candidates), "")
             if self.lost:
                 self.nodes.remove_node(candidates[self.lost], allow_graceful=False)
@@ -140,7 +140,7 @@ def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
     kills = Kills(executor, worker_at)
     assert result_of(config, executor, tmp_path, kills) == request.getfixturevalue(expected)
     assert kills.done == {"worker", "learner"}
-    assert executor.pool.counters["crashed"] == 1
+    assert executor.pool.state.counters["crashed"] == 1
 
 
 @pytest.mark.slow

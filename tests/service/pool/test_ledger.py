@@ -6,7 +6,7 @@ import random
 
 import pytest
 
-from t6gps.service.pool.attempt import Failure
+from t6gps.service.pool.attempt import Failure, FailureKind
 from t6gps.service.pool.ledger import ATTEMPTS_ALLOWED_N, FAILURES_ALLOWED_N, HOPELESS_N, Ledger
 from t6gps.storage.records import EpisodePlan
 
@@ -16,7 +16,7 @@ def plans(n: int, iteration: int = 0) -> list[EpisodePlan]:
 
 
 def failure(kind: str = "raised") -> Failure:
-    return Failure(kind, "PhysicsError", "it fell over", seed=1, step=3)
+    return Failure(FailureKind(kind), "PhysicsError", "it fell over", seed=1, step=3)
 
 
 @pytest.fixture

@@ -3,19 +3,31 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, field
 from itertools import pairwise
+from pathlib import Path
 from typing import Any
 
 import pytest
 
-from t6gps.service.pool import supervisor as supervising
-from t6gps.service.pool.attempt import Failure
+from t6gps.service.pool.attempt import Failure, FailureKind
 from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import FACTOR, TIMINGS, EpisodeTimes
+from t6gps.service.pool.decision_log import DecisionLog, replay
 from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.supervisor import PLANS_PER_WORKER, Pool
-from t6gps.service.pool.transport import Alive, Died, Done, Handle, Identity, Ready, Remains, Report, Transport
-from t6gps.service.pool.workers import LONGEST_BACK_OFF_S
+from t6gps.service.pool.messages import Alive, Died, Ready, Remains
+from t6gps.service.pool.pool import Pool
+from t6gps.service.pool.scaling import PLANS_PER_WORKER
+from t6gps.service.pool.state import (
+    LONGEST_BACK_OFF_S,
+    NEXT_PHASES,
+    NEXT_STATES,
+    Identity,
+    PoolState,
+    WorkerId,
+    WorkerPhase,
+)
+from t6gps.service.pool.transport import Done, Report, Transport
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import stub
@@ -29,14 +41,23 @@ def plans(n: int) -> list[EpisodePlan]:
     return [EpisodePlan(i, 0, i, 100 + i, 4, 0, 0.0, 0.1, 0) for i in range(n)]
 
 
+@dataclass
+class PaperWorker:
+    """A worker on paper: it is ready at a time, and has a queue, as a process has."""
+
+    ready_s: float
+    ready: bool = False
+    queue: list[EpisodePlan] = field(default_factory=list)
+    until_s: float = 0.0
+
+
 class Paper(Transport):
-    """Workers on paper. Each has a queue, as a process has, and does nothing but what is in `faults`."""
+    """Workers on paper. They do what they are told, but for what is in the sets below."""
 
     def __init__(self) -> None:
         self.now_s = 0.0
         self.room = 100
-        self.alive: dict[int, dict[str, Any]] = {}
-        self.killed: list[int] = []
+        self.alive: dict[WorkerId, PaperWorker] = {}
         self.starts: list[tuple[int, int, float]] = []
         self.reports: list[Report] = []
         self.fails_to_start = False
@@ -46,101 +67,106 @@ class Paper(Transport):
         self.raising: set[int] = set()
         self.hanging: set[int] = set()
         self.crashing: set[int] = set()
-        self.silent: set[int] = set()
+        self.silent: set[WorkerId] = set()
         self.most_in_flight = 0
         self.polls_n = 0
 
     def clock(self) -> float:
         return self.now_s
 
-    def start(self, slot: int, incarnation: int) -> Handle:
-        number = len(self.starts)
-        self.starts.append((slot, incarnation, self.now_s))
-        self.alive[number] = {"ready_s": self.now_s + START_S, "queue": [], "ready": False, "slot": slot, "pings": 0}
-        return number
+    def start(self, worker: WorkerId) -> None:
+        self.starts.append((*worker, self.now_s))
+        self.alive[worker] = PaperWorker(self.now_s + START_S)
 
-    def send(self, handle: Handle, plan: EpisodePlan) -> None:
-        worker = self.alive[handle]
-        assert worker["ready"]
-        if not worker["queue"]:
-            worker["until_s"] = self.now_s + self.episode_s
-        worker["queue"].append(plan)
-        assert len(worker["queue"]) <= PLANS_PER_WORKER
-        self.most_in_flight = max(self.most_in_flight, sum(len(w["queue"]) for w in self.alive.values()))
+    def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
+        paper = self.alive.get(worker)
+        if paper is None:  # it has died, which is reported
+            return
+        assert paper.ready
+        if not paper.queue:
+            paper.until_s = self.now_s + self.episode_s
+        paper.queue.append(plan)
+        assert len(paper.queue) <= PLANS_PER_WORKER
+        self.most_in_flight = max(self.most_in_flight, sum(len(each.queue) for each in self.alive.values()))
 
-    def ping(self, handle: Handle) -> None:
-        if handle not in self.silent:
-            self.reports.append(Alive(handle))
+    def ping(self, worker: WorkerId) -> None:
+        if worker not in self.silent:
+            self.reports.append(Alive(worker))
 
     def poll(self, wait_s: float) -> list[Report]:
         self.now_s += wait_s
         self.polls_n += 1
         assert self.polls_n < 20_000, "the run does not end"
-        for handle, worker in list(self.alive.items()):
-            if not worker["ready"] and self.now_s >= worker["ready_s"] and self.placed(handle):
+        for worker, paper in list(self.alive.items()):
+            if not paper.ready and self.now_s >= paper.ready_s and self.placed(worker):
                 if self.fails_to_start:
-                    self.die(handle)
+                    self.die(worker)
                     continue
-                worker["ready"] = True
-                self.reports.append(Ready(handle, Identity(handle, "paper", self.settings)))
-            while worker["queue"] and self.now_s >= worker["until_s"]:
-                if worker["queue"][0].episode_id in self.hanging:
+                paper.ready = True
+                self.reports.append(Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings)))
+            while paper.queue and self.now_s >= paper.until_s:
+                if paper.queue[0].episode_id in self.hanging:
                     break
-                if worker["queue"][0].episode_id in self.crashing:
-                    self.die(handle)
+                if paper.queue[0].episode_id in self.crashing:
+                    self.die(worker)
                     break
-                plan = worker["queue"].pop(0)
-                worker["until_s"] = self.now_s + self.episode_s
+                plan = paper.queue.pop(0)
+                paper.until_s = self.now_s + self.episode_s
                 result: Episode | Failure = stub.episode(plan, POLICY)
                 if plan.episode_id in self.raising:
-                    result = Failure("raised", "PhysicsError", "it fell over", plan.seed, 2)
-                self.reports.append(Done(handle, plan, result, self.digest))
-        found, self.reports = self.reports, []
-        return found
+                    result = Failure(FailureKind.RAISED, "PhysicsError", "it fell over", plan.seed, 2)
+                self.reports.append(Done(worker, plan, result, self.digest))
+        reports, self.reports = self.reports, []
+        return reports
 
-    def examine(self, handle: Handle) -> Remains:
-        return Remains("stacks of " + str(handle), "log")
+    def examine(self, worker: WorkerId) -> Remains:
+        return Remains(f"stacks of {worker}", "log")
 
-    def kill(self, handle: Handle) -> None:
-        self.alive.pop(handle, None)
-        self.killed.append(handle)
-        self.reports = [report for report in self.reports if report.handle != handle]
+    def kill(self, worker: WorkerId) -> None:
+        self.alive.pop(worker, None)
+        self.reports = [report for report in self.reports if report.worker != worker]
 
-    def placed(self, handle: Handle) -> bool:
-        return list(self.alive).index(handle) < self.room
+    def placed(self, worker: WorkerId) -> bool:
+        return list(self.alive).index(worker) < self.room
 
     def free_workers(self) -> int:
         return max(self.room - len(self.alive), 0)
 
-    def die(self, handle: Handle, error: str = "ActorDiedError") -> None:
+    def die(self, worker: WorkerId, error: str = "ActorDiedError") -> None:
         """The process ends; its supervisor hears of it."""
-        del self.alive[handle]
-        self.reports.append(Died(handle, error, "the process ended"))
+        del self.alive[worker]
+        self.reports.append(Died(worker, error, "the process ended"))
 
 
-class Wishes(Control):
+class Requests(Control):
     """Control without files."""
 
     def __init__(self) -> None:
         super().__init__(None, 100)
-        self.wished: int | None = None
+        self.asked: int | None = None
 
-    def wish(self) -> int | None:
-        wished, self.wished = self.wished, None
-        return wished
+    def scale_request(self) -> int | None:
+        asked, self.asked = self.asked, None
+        return asked
 
 
 class House:
     """A pool of paper workers, with its ledger."""
 
-    def __init__(self, wanted: int, episodes: int = 0, autoscale: tuple[int, int] | None = None) -> None:
-        self.paper, self.ledger, self.wishes = Paper(), Ledger(), Wishes()
+    def __init__(
+        self,
+        wanted: int,
+        episodes: int = 0,
+        autoscale: tuple[int, int] | None = None,
+        bytes_in_flight: int = 2**30,
+        log: DecisionLog | None = None,
+    ) -> None:
+        self.paper, self.ledger, self.requests = Paper(), Ledger(), Requests()
         self.quarantined: list[EpisodePlan] = []
-        self.pool = Pool(
-            self.paper, self.ledger, wanted, SETTINGS, self.wishes, self.quarantined.append, self.paper.clock, autoscale
-        )
-        self.ledger.open(plans(episodes))
-        self.pool.open({0: "policy"})
+        times = EpisodeTimes(SHORTEST_S)
+        state = PoolState(wanted, SETTINGS, self.ledger, TIMINGS, times, autoscale, bytes_in_flight=bytes_in_flight)
+        self.pool = Pool(state, self.paper, self.requests, self.quarantined.append, log, self.paper.clock)
+        self.pool.open(plans(episodes), [], {0: "policy"})
 
     def run(self, seconds: float) -> None:
         """Tick for some time of the paper's clock."""
@@ -152,13 +178,13 @@ class House:
         """Tick until the condition holds; how long that took on the paper's clock."""
         start_s = self.paper.now_s
         while not condition():
-            assert self.paper.now_s - start_s < seconds, self.pool.reason
+            assert self.paper.now_s - start_s < seconds, self.pool.state.reason
             self.pool.tick(0.1)
         return self.paper.now_s - start_s
 
     @property
     def ready(self) -> int:
-        return int(self.pool.status(self.paper.now_s)["ready"])
+        return int(self.pool.status()["ready"])
 
     def sample(self, after_each: Callable[[list[int]], None] = lambda _: None) -> list[int]:
         """Numbers of the episodes in the order of their arrival; `after_each` sees those that there are so far."""
@@ -175,7 +201,7 @@ class House:
 def test_every_planned_episode_arrives_once() -> None:
     house = House(3, 20)
     assert sorted(house.sample()) == list(range(20))
-    assert house.pool.state == "RUNNING"
+    assert house.pool.state.condition == "RUNNING"
     assert house.ledger.counters["committed"] == 20
 
 
@@ -192,9 +218,8 @@ def test_no_worker_has_more_than_two_plans_and_what_waits_for_the_learner_counts
     assert house.paper.most_in_flight <= 2 * PLANS_PER_WORKER
 
 
-def test_large_episodes_are_under_way_one_by_one(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(supervising, "BYTES_IN_FLIGHT", 1)
-    house = House(2, 10)
+def test_large_episodes_are_under_way_one_by_one() -> None:
+    house = House(2, 10, bytes_in_flight=1)
 
     def begin_to_count(found: list[int]) -> None:
         if len(found) == 5:
@@ -212,8 +237,8 @@ def test_a_worker_that_dies_is_replaced_and_its_episodes_are_run_again() -> None
             house.paper.die(next(iter(house.paper.alive)))
 
     assert sorted(house.sample(kill)) == list(range(20))
-    assert house.pool.workers[0].incarnation == 2
-    assert house.until(lambda: house.pool.state == "RUNNING", 5) <= 5
+    assert house.pool.state.workers[0].id.incarnation == 2
+    assert house.until(lambda: house.pool.state.condition == "RUNNING", 5) <= 5
 
 
 def test_all_workers_die_at_once_and_the_run_recovers_by_itself() -> None:
@@ -224,9 +249,9 @@ def test_all_workers_die_at_once_and_the_run_recovers_by_itself() -> None:
             for handle in list(house.paper.alive):
                 house.paper.die(handle)
             house.pool.tick()
-            assert house.pool.state == "DEGRADED"
-            assert "0 of 3 workers" in house.pool.reason
-            assert house.until(lambda: house.pool.state == "RUNNING", 5) <= 5
+            assert house.pool.state.condition == "DEGRADED"
+            assert "0 of 3 workers" in house.pool.state.reason
+            assert house.until(lambda: house.pool.state.condition == "RUNNING", 5) <= 5
 
     assert sorted(house.sample(kill_all)) == list(range(30))
 
@@ -236,7 +261,7 @@ def test_back_off_doubles_up_to_its_cap_and_the_breaker_opens_with_the_reason() 
     house.paper.fails_to_start = True
     with pytest.raises(RunError, match=r"5 workers in a row could not start.*the process ended"):
         house.run(600)
-    assert house.pool.state == "FAILED"
+    assert house.pool.state.condition == "FAILED"
     times = [at for _, _, at in house.paper.starts]
     waits = [later - earlier - START_S for earlier, later in pairwise(times)]
     assert waits[0] == pytest.approx(0, abs=0.11)
@@ -248,12 +273,12 @@ def test_back_off_is_capped_and_a_slot_that_cannot_start_does_not_end_a_run_that
     house = House(2)
     house.until(lambda: house.ready == 2, 5)
     house.paper.fails_to_start = True
-    house.paper.die(house.pool.workers[1].handle)
+    house.paper.die(house.pool.state.workers[1].id)
     house.run(300)
     times = [at for slot, _, at in house.paper.starts if slot == 1]
     assert times[-1] - times[-2] == pytest.approx(LONGEST_BACK_OFF_S + START_S, abs=0.21)
-    assert house.pool.state == "DEGRADED"
-    assert "the process ended" in house.pool.reason
+    assert house.pool.state.condition == "DEGRADED"
+    assert "the process ended" in house.pool.state.reason
 
 
 def test_a_hang_is_found_by_its_deadline_and_its_stacks_are_kept() -> None:
@@ -270,7 +295,7 @@ def test_a_hang_is_found_by_its_deadline_and_its_stacks_are_kept() -> None:
     assert failure.trace.startswith("stacks of")
     took_s = float(failure.message.split()[-2])
     assert took_s <= max(SHORTEST_S, FACTOR * EPISODE_S) + 0.2
-    assert house.pool.counters["hung"] == 1
+    assert house.pool.state.counters["hung"] == 1
 
 
 def test_an_episode_that_hangs_again_gets_twice_the_time() -> None:
@@ -287,9 +312,9 @@ def test_a_worker_ten_times_slower_does_not_hang() -> None:
     house = House(1, 5)
     house.sample()
     house.paper.episode_s = 10 * EPISODE_S
-    house.ledger.open([EpisodePlan(9, 0, 9, 1, 4, 0, 0.0, 0.1, 0)])
+    house.pool.open([EpisodePlan(9, 0, 9, 1, 4, 0, 0.0, 0.1, 0)], [], {0: "policy"})
     assert house.sample() == [9]
-    assert house.pool.counters["hung"] == 0
+    assert house.pool.state.counters["hung"] == 0
 
 
 def test_deadlines_follow_the_measured_times_and_the_length_of_the_episode() -> None:
@@ -306,9 +331,9 @@ def test_deadlines_follow_the_measured_times_and_the_length_of_the_episode() -> 
 def test_an_idle_worker_that_gives_no_sign_of_life_is_replaced() -> None:
     house = House(2)
     house.until(lambda: house.ready == 2, 5)
-    house.paper.silent.add(house.pool.workers[0].handle)
-    assert house.until(lambda: house.pool.workers[0].incarnation == 2, 25) <= 22
-    assert house.pool.workers[1].incarnation == 1
+    house.paper.silent.add(house.pool.state.workers[0].id)
+    assert house.until(lambda: house.pool.state.workers[0].id.incarnation == 2, 25) <= 22
+    assert house.pool.state.workers[1].id.incarnation == 1
 
 
 def test_a_poison_episode_is_quarantined_after_three_failures_and_the_run_goes_on() -> None:
@@ -316,7 +341,7 @@ def test_a_poison_episode_is_quarantined_after_three_failures_and_the_run_goes_o
     house.paper.raising.add(5)
     assert sorted(house.sample()) == [n for n in range(12) if n != 5]
     assert [plan.episode_id for plan in house.quarantined] == [5]
-    status = house.pool.status(house.paper.now_s)
+    status = house.pool.status()
     assert status["quarantined"] == [5]
     assert status["episodes"]["failures"] == 3
 
@@ -327,7 +352,7 @@ def test_an_episode_that_kills_its_worker_three_times_is_quarantined() -> None:
     assert sorted(house.sample()) == [n for n in range(12) if n != 6]
     assert [failure.kind for failure in house.ledger.failures[6]] == ["crash"] * 3
     assert house.ledger.failures[6][0].log == "log"
-    assert house.pool.counters["crashed"] == 3
+    assert house.pool.state.counters["crashed"] == 3
 
 
 def test_a_run_in_which_everything_fails_ends_with_one_sentence() -> None:
@@ -335,7 +360,7 @@ def test_a_run_in_which_everything_fails_ends_with_one_sentence() -> None:
     house.paper.raising = set(range(50))
     with pytest.raises(RunError, match=r"nothing but failures comes back; the last: episode \d+: PhysicsError"):
         house.sample()
-    assert house.pool.state == "FAILED"
+    assert house.pool.state.condition == "FAILED"
 
 
 def test_scaling_reaches_its_wish_while_sampling_and_loses_nothing() -> None:
@@ -345,9 +370,9 @@ def test_scaling_reaches_its_wish_while_sampling_and_loses_nothing() -> None:
     def scale(_: list[int]) -> None:
         nonlocal asked_s
         if not asked_s:
-            house.wishes.wished, asked_s = wishes[0], house.paper.now_s
+            house.requests.asked, asked_s = wishes[0], house.paper.now_s
         assert house.paper.now_s - asked_s <= 5
-        if house.ready == wishes[0] == len(house.pool.workers) and len(wishes) > 1:
+        if house.ready == wishes[0] == len(house.pool.state.workers) and len(wishes) > 1:
             wishes.pop(0)
             asked_s = 0.0
         elif len(wishes) == 1:
@@ -356,19 +381,19 @@ def test_scaling_reaches_its_wish_while_sampling_and_loses_nothing() -> None:
     assert sorted(house.sample(scale)) == list(range(60))
     assert house.ready == wishes[0] == 2
     assert house.ledger.counters["duplicates"] == 0
-    assert house.pool.counters["crashed"] == 0
+    assert house.pool.state.counters["crashed"] == 0
 
 
 def test_a_draining_worker_finishes_its_episode_and_hands_the_other_back() -> None:
     house = House(2, 10)
-    house.until(lambda: all(len(w.plans) == 2 for w in house.pool.workers.values()) and house.ready == 2, 5)
-    kept, given = house.pool.workers[1].plans
-    house.wishes.wished = 1
+    house.until(lambda: all(len(w.plans) == 2 for w in house.pool.state.workers.values()) and house.ready == 2, 5)
+    kept, given = house.pool.state.workers[1].plans
+    house.requests.asked = 1
     house.pool.tick()
-    assert house.pool.workers[1].draining
-    assert list(house.pool.workers[1].plans) == [kept]
+    assert house.pool.state.workers[1].phase == WorkerPhase.DRAINING
+    assert list(house.pool.state.workers[1].plans) == [kept]
     assert given.episode_id not in house.ledger.leases
-    house.until(lambda: 1 not in house.pool.workers, 2)
+    house.until(lambda: 1 not in house.pool.state.workers, 2)
     assert kept.episode_id not in house.ledger.leases  # it arrived
     assert sorted(house.sample()) == list(range(10))
 
@@ -378,10 +403,10 @@ def test_scaled_to_nothing_a_run_pauses_and_goes_on_when_it_is_scaled_up() -> No
 
     def pause(found: list[int]) -> None:
         if len(found) == 1:
-            house.wishes.wished = 0
-            house.until(lambda: not house.pool.workers, 5)
-            assert house.pool.state == "PAUSED"
-            house.wishes.wished = 1
+            house.requests.asked = 0
+            house.until(lambda: not house.pool.state.workers, 5)
+            assert house.pool.state.condition == "PAUSED"
+            house.requests.asked = 1
 
     assert sorted(house.sample(pause)) == list(range(10))
 
@@ -390,10 +415,10 @@ def test_a_worker_that_waits_for_a_cpu_is_named_and_comes_when_there_is_one() ->
     house = House(1, 0)
     house.paper.room = 1
     house.until(lambda: house.ready == 1, 5)
-    house.wishes.wished = 2
+    house.requests.asked = 2
     house.run(5)
-    assert house.pool.state == "DEGRADED"
-    assert "1 wait for a CPU" in house.pool.reason
+    assert house.pool.state.condition == "DEGRADED"
+    assert "1 wait for a CPU" in house.pool.state.reason
     house.run(200)
     assert len(house.paper.starts) == 2  # it is waited for, not started again and again
     house.paper.room += 1  # a node joins
@@ -425,3 +450,52 @@ def test_a_worker_with_other_settings_or_another_policy_ends_the_run() -> None:
     with pytest.raises(RunError, match="another policy than version 0"):
         house.sample()
     assert house.ledger.counters["committed"] == 0
+
+
+def test_what_was_decided_under_faults_is_decided_again_from_the_log(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path)
+    house = House(2, 60, log=log)
+    house.paper.hanging.add(7)
+    house.paper.crashing.add(11)
+    house.paper.raising.add(13)
+
+    def disturb(found: list[int]) -> None:
+        if len(found) == 20:
+            house.requests.asked = 4
+        if len(found) == 40:
+            house.paper.die(next(iter(house.paper.alive)))
+
+    assert sorted(house.sample(disturb)) == [number for number in range(60) if number not in (7, 11, 13)]
+    log.close()
+    assert replay(tmp_path / "decisions.jsonl") > 100
+
+
+def test_a_log_that_has_grown_large_begins_anew_with_the_state_and_is_replayed_from_there(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path, largest_bytes=20_000)
+    house = House(2, 60, autoscale=(1, 3), log=log)
+    house.paper.crashing.add(11)
+    assert len(house.sample()) == 59
+    log.close()
+    for name in ("decisions.jsonl", "decisions.1.jsonl"):
+        assert replay(tmp_path / name) > 0
+        assert (tmp_path / name).stat().st_size < 30_000
+
+
+def test_a_log_of_which_a_line_was_changed_is_not_replayed(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path)
+    house = House(2, 10, log=log)
+    house.sample()
+    log.close()
+    path = tmp_path / "decisions.jsonl"
+    lines = path.read_text().splitlines()
+    path.write_text("\n".join(lines[:5] + [lines[5].replace('"episode_id":0', '"episode_id":9')] + lines[6:]))
+    with pytest.raises(RunError, match="line 6 is decided otherwise"):
+        replay(path)
+    path.write_text("\n".join(lines[:5] + [lines[5][:20]]))
+    with pytest.raises(RunError, match="line 6 is no round of a decision log"):
+        replay(path)
+
+
+@pytest.mark.parametrize("phases", [NEXT_PHASES, NEXT_STATES], ids=["worker", "run"])
+def test_every_state_is_in_its_table_of_transitions(phases: dict[Any, set[Any]]) -> None:
+    assert set(phases) == set(type(next(iter(phases))))

@@ -88,4 +88,4 @@ def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behi
     assert control.status(this)["state"] == "STOPPED"
     with pytest.raises(RunError, match=r"not running \(STOPPED.*--resume"):
         control.scale(this, 2)
-    assert not (this.pool / "wish.json").exists()
+    assert not (this.pool / "scale_request.json").exists()

@@ -1,0 +1,179 @@
+"""What the supervisor observes, and what it instructs: plain data that can be written down and read again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+from t6gps.service.pool.attempt import Failure
+from t6gps.service.pool.state import Ending, Identity, RunState, WorkerId
+from t6gps.storage.records import EpisodePlan
+
+
+@dataclass(frozen=True)
+class Opened:
+    """A batch of plans begins; `quarantined` ones are not tried, `policy_digests` by version."""
+
+    plans: tuple[EpisodePlan, ...]
+    quarantined: tuple[int, ...]
+    policy_digests: Mapping[int, str]
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A worker has started."""
+
+    worker: WorkerId
+    identity: Identity
+
+
+@dataclass(frozen=True)
+class Alive:
+    """An idle worker has answered."""
+
+    worker: WorkerId
+
+
+@dataclass(frozen=True)
+class Sampled:
+    """An episode came back."""
+
+    worker: WorkerId
+    plan: EpisodePlan
+    nbytes: int
+    policy_digest: str
+
+
+@dataclass(frozen=True)
+class Failed:
+    """An attempt at an episode failed in the worker."""
+
+    worker: WorkerId
+    plan: EpisodePlan
+    failure: Failure
+    policy_digest: str
+
+
+@dataclass(frozen=True)
+class Unserved:
+    """A worker could not get the policy that a plan names."""
+
+    worker: WorkerId
+    plan: EpisodePlan
+
+
+@dataclass(frozen=True)
+class Died:
+    """A worker's process has ended, or could not begin."""
+
+    worker: WorkerId
+    error: str
+    message: str
+
+
+@dataclass(frozen=True)
+class Remains:
+    """What could be learned of a worker from outside before it was killed.
+
+    blameless   somebody else ended or stopped it, or its node is gone: it is not the episode's fault
+    """
+
+    stacks: str = ""
+    log: str = ""
+    blameless: bool = False
+
+
+@dataclass(frozen=True)
+class Ended:
+    """A worker was ended as instructed."""
+
+    worker: WorkerId
+    remains: Remains
+
+
+@dataclass(frozen=True)
+class Durable:
+    """An episode that came back is durable."""
+
+    episode_id: int
+
+
+@dataclass(frozen=True)
+class Capacity:
+    """There is room for `free_n` more workers; those of `waiting` have found none."""
+
+    free_n: int
+    waiting: tuple[WorkerId, ...]
+
+
+@dataclass(frozen=True)
+class ScaleRequested:
+    """Somebody asks for another number of workers."""
+
+    workers: int
+
+
+Observation = Opened | Ready | Alive | Sampled | Failed | Unserved | Died | Ended | Durable | Capacity | ScaleRequested
+
+
+@dataclass(frozen=True)
+class Start:
+    """Start a worker; a `Ready` or a `Died` follows."""
+
+    worker: WorkerId
+
+
+@dataclass(frozen=True)
+class Send:
+    """Give a worker a plan; a `Sampled`, `Failed`, `Unserved` or `Died` follows."""
+
+    worker: WorkerId
+    plan: EpisodePlan
+
+
+@dataclass(frozen=True)
+class Ping:
+    """Ask an idle worker for a sign of life; an `Alive` or a `Died` follows."""
+
+    worker: WorkerId
+
+
+@dataclass(frozen=True)
+class End:
+    """Look at a worker and end it at once, whatever it does; an `Ended` follows."""
+
+    worker: WorkerId
+    why: Ending
+
+
+@dataclass(frozen=True)
+class AskCapacity:
+    """Ask the cluster for room, and whether these workers have found some; a `Capacity` follows."""
+
+    starting: tuple[WorkerId, ...]
+
+
+@dataclass(frozen=True)
+class Accept:
+    """Hand an episode that came back to the run; a `Durable` follows. Others that came back are dropped."""
+
+    worker: WorkerId
+    episode_id: int
+
+
+@dataclass(frozen=True)
+class Quarantine:
+    """Keep what is needed to find out why an episode fails."""
+
+    plan: EpisodePlan
+
+
+@dataclass(frozen=True)
+class Publish:
+    """Tell how the run is."""
+
+    condition: RunState
+    reason: str
+
+
+Instruction = Start | Send | Ping | End | AskCapacity | Accept | Quarantine | Publish

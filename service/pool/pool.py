@@ -1,0 +1,178 @@
+"""The pool: carries out what the supervisor decides, and hands episodes to the run."""
+
+from __future__ import annotations
+
+import time
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+from t6gps.service.pool import control
+from t6gps.service.pool.attempt import Failure
+from t6gps.service.pool.control import Control, Status
+from t6gps.service.pool.decision_log import DecisionLog
+from t6gps.service.pool.messages import (
+    Accept,
+    AskCapacity,
+    Capacity,
+    Durable,
+    End,
+    Ended,
+    Failed,
+    Instruction,
+    Observation,
+    Opened,
+    Ping,
+    Publish,
+    Quarantine,
+    Remains,
+    Sampled,
+    ScaleRequested,
+    Send,
+    Start,
+    Unserved,
+)
+from t6gps.service.pool.state import Ending, PoolState, RunState, WorkerId
+from t6gps.service.pool.supervisor import decide
+from t6gps.service.pool.transport import Done, Transport
+from t6gps.storage.errors import RunError
+from t6gps.storage.records import Episode, EpisodePlan
+
+
+class Pool:
+    """Keeps the workers of a run at work on the plans of one batch after another.
+
+    state       what the supervisor knows
+    phase       what the run does at present, for its status
+    ticked_s    when the last round began (s, `clock`)
+    quarantine  keeps a crash bundle; called with a plan whose last attempt has failed
+    """
+
+    def __init__(
+        self,
+        state: PoolState,
+        transport: Transport,
+        control_: Control,
+        quarantine: Callable[[EpisodePlan], None],
+        log: DecisionLog | None = None,
+        clock: Callable[[], float] = time.monotonic,
+    ) -> None:
+        self.state, self.phase, self.ticked_s = state, "starting", float("-inf")
+        self._transport, self._control, self._quarantine = transport, control_, quarantine
+        self._log, self._clock = log, clock
+        self._unseen: list[Observation] = []
+        self._came: dict[tuple[WorkerId, int], Episode] = {}
+        self._accepted: deque[tuple[int, Episode]] = deque()
+        self._waits: dict[str, float] = {}
+
+    def tick(self, wait_s: float = 0.0) -> None:
+        """One round: observe, decide, carry out. Waits up to `wait_s` for news, which are for the next round.
+
+        RunError when the run cannot go on (`supervisor.decide`).
+        """
+        self._listen(0.0)
+        self.ticked_s = self._clock()
+        workers = self._control.scale_request()
+        if workers is not None:
+            self._unseen.append(ScaleRequested(workers))
+        self._decide()
+        if self._control.due(self.ticked_s, self.state.condition):
+            self._control.publish(self.status())
+        if self.state.condition is RunState.FAILED:
+            raise RunError(self.state.reason)
+        if wait_s > 0:
+            self._listen(wait_s)
+
+    def open(self, plans: Sequence[EpisodePlan], quarantined: Sequence[int], policy_digests: Mapping[int, str]) -> None:
+        """Begin a batch; what comes of other plans than these is late."""
+        self._accepted.clear()
+        self.phase = "sampling"
+        self._unseen.append(Opened(tuple(plans), tuple(quarantined), policy_digests))
+        self._decide()
+
+    def sample(self, keep: Callable[[Episode], None]) -> None:
+        """Let the workers run the batch until no episode is missing; see `deliver` for `keep`."""
+        while self.state.ledger.backlog:
+            self.tick(0.0 if self._accepted else control.TICK_S)
+            self.deliver(keep)
+        if self.state.ledger.hopeless:
+            self.tick()
+
+    def deliver(self, keep: Callable[[Episode], None]) -> None:
+        """Hand over the episodes that are there; when `keep` returns, one is durable."""
+        while self._accepted:
+            episode_id, episode = self._accepted.popleft()
+            keep(episode)
+            self._unseen.append(Durable(episode_id))
+            self._decide()
+
+    def close(self, condition: RunState, reason: str) -> None:
+        """End every worker and say how the run ended."""
+        for worker in self.state.workers.values():
+            self._transport.kill(worker.id)
+        self.state.workers.clear()
+        if self.state.condition is not RunState.FAILED:
+            self.state.turn(condition, reason)
+        self._control.publish(self.status())
+
+    def wait(self, who: str, whom: str, begins: bool) -> None:
+        """Note that somebody begins or ends to wait for somebody."""
+        if begins:
+            self._waits.setdefault(f"{who} waits for {whom}", self._clock())
+        else:
+            self._waits.pop(f"{who} waits for {whom}", None)
+
+    def status(self) -> Status:
+        """Everything that `t6gps status` shows."""
+        return control.describe(self.state, self.phase, self._waits, self._clock())
+
+    def _listen(self, wait_s: float) -> None:
+        """Take what the transport reports; episodes stay here, the supervisor sees their size."""
+        for report in self._transport.poll(wait_s):
+            if not isinstance(report, Done):
+                self._unseen.append(report)
+            elif report.result is None:
+                self._unseen.append(Unserved(report.worker, report.plan))
+            elif isinstance(report.result, Failure):
+                self._unseen.append(Failed(report.worker, report.plan, report.result, report.policy_digest))
+            else:
+                self._came[report.worker, report.plan.episode_id] = report.result
+                self._unseen.append(Sampled(report.worker, report.plan, report.result.nbytes, report.policy_digest))
+
+    def _decide(self) -> None:
+        """Decide and carry out, until nothing new follows from it."""
+        first = True
+        while first or self._unseen:
+            first, observed, now = False, self._unseen, self._clock()
+            self._unseen = []
+            if self._log is not None:
+                self._log.before(self.state)
+            decided = decide(self.state, observed, now)
+            if self._log is not None:
+                self._log.after(self.state, now, observed, decided)
+            for instruction in decided:
+                self._carry_out(instruction)
+        self._came.clear()
+
+    def _carry_out(self, instruction: Instruction) -> None:
+        match instruction:
+            case Start():
+                self._transport.start(instruction.worker)
+            case Send():
+                self._transport.send(instruction.worker, instruction.plan)
+            case Ping():
+                self._transport.ping(instruction.worker)
+            case End():
+                drained = instruction.why is Ending.DRAINED
+                remains = Remains() if drained else self._transport.examine(instruction.worker)
+                self._transport.kill(instruction.worker)
+                self._unseen.append(Ended(instruction.worker, remains))
+            case AskCapacity():
+                waiting = tuple(worker for worker in instruction.starting if not self._transport.placed(worker))
+                self._unseen.append(Capacity(self._transport.free_workers(), waiting))
+            case Accept():
+                episode = self._came.pop((instruction.worker, instruction.episode_id))
+                self._accepted.append((instruction.episode_id, episode))
+            case Quarantine():
+                self._quarantine(instruction.plan)
+            case Publish():
+                self._control.publish(self.status())
