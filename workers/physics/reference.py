@@ -1,4 +1,4 @@
-"""The law of the robot's cables, in plain Python: the reference for workers/physics/native/stepper.c.
+"""The law of the robot's cables, in plain Python: the reference for workers/physics/bullet_hooks/native/stepper.c.
 
 One physics step of length h: (1) the winches move, (2) the bars are read, (3) loads are computed and applied,
 (4) Bullet steps. A cable between nodes a and b:

@@ -16,9 +16,9 @@ import numpy as np
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.bullet_hooks.overrides import take_over
+from t6gps.workers.physics.bullet_hooks.plugin import PluginStepper
 from t6gps.workers.physics.observer import extremes
-from t6gps.workers.physics.overrides import take_over
-from t6gps.workers.physics.plugin import PluginStepper
 from t6gps.workers.physics.reference import ReferenceStepper, read_state
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS, BARS_N, CABLE_LENGTH_M, CABLES_N, NODES_M

@@ -13,8 +13,9 @@ import pytest
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.episode.start import turn
 from t6gps.workers.ground.terrain import Terrain, generate
-from t6gps.workers.physics import plugin, simulation
+from t6gps.workers.physics import simulation
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.bullet_hooks import plugin
 from t6gps.workers.physics.reference import loads, tensions
 from t6gps.workers.physics.simulation import (
     CONTROL_STEP_S,

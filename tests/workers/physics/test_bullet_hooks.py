@@ -12,8 +12,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t6gps.workers.ground.terrain import generate
-from t6gps.workers.physics import overrides, simulation
+from t6gps.workers.physics import simulation
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.bullet_hooks import overrides
 from t6gps.workers.physics.simulation import Simulation, neutral_state
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings

@@ -35,7 +35,7 @@ struct b3PluginArguments {
     double floats[128];
 };
 
-/* Shared with workers/physics/plugin.py (BLOCK): the same fields in the same order. */
+/* Shared with workers/physics/bullet_hooks/plugin.py (BLOCK): the same fields in the same order. */
 struct block {
     double winch_step_m, stiffness, damping, max_tension, axial_damping, bar_length;
     double command[CABLES], rest[CABLES];
