@@ -14,7 +14,9 @@ from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation, nominal_rest_length
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
+from t6gps.workers.robot.neutral import nominal_rest_length
 from t6gps.workers.robot.symmetry import CABLE_MAP, PROPER
 from t6gps.workers.settings import RobotSettings
 from t6gps.workers.worker import RolloutWorker
@@ -30,7 +32,7 @@ class SerialExecutor(Executor):
         self,
         config: Config,
         run: Run | None = None,
-        simulation: Callable[[RobotSettings], Simulation] = Simulation,
+        simulation: Callable[[RobotSettings], Engine] = PyBulletEngine,
     ) -> None:
         super().__init__(config, run)
         self._worker = RolloutWorker(config.rollout, simulation)

@@ -16,8 +16,11 @@ from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers.episode.rollout import rollout
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.physics.bullet import pybullet
-from t6gps.workers.physics.reference import apply_loads, move_winches, read_state
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation, neutral_state, nominal_rest_length
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.bullet_world import apply_loads, read_state
+from t6gps.workers.physics.cables import move_winches
+from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
+from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings
@@ -44,21 +47,32 @@ def _reference_control_step(client: int, bodies: list[int], start: RobotState, c
     return time.perf_counter() - begin, bare_s
 
 
-class _TimedSimulation(Simulation):
-    """Counts the seconds that control steps take, and those of making the ground."""
+class _TimedEngine(Engine):
+    """Another engine, with the seconds that its control steps took, and those of making the ground."""
 
-    steps_s = ground_s = 0.0
-
-    def control_step(self, command: Array) -> RobotState:
-        start = time.perf_counter()
-        state = super().control_step(command)
-        self.steps_s += time.perf_counter() - start
-        return state
+    def __init__(self, engine: Engine) -> None:
+        self.robot, self._engine = engine.robot, engine
+        self.steps_s = self.ground_s = 0.0
 
     def set_ground(self, terrain: Terrain | None) -> None:
         start = time.perf_counter()
-        super().set_ground(terrain)
+        self._engine.set_ground(terrain)
         self.ground_s += time.perf_counter() - start
+
+    def reset(self, state: RobotState) -> None:
+        self._engine.reset(state)
+
+    def state(self) -> RobotState:
+        return self._engine.state()
+
+    def control_step(self, command: Array) -> RobotState:
+        start = time.perf_counter()
+        state = self._engine.control_step(command)
+        self.steps_s += time.perf_counter() - start
+        return state
+
+    def close(self) -> None:
+        self._engine.close()
 
 
 def episode_overhead(repeats: int = 9) -> dict[str, float]:
@@ -77,15 +91,15 @@ def episode_overhead(repeats: int = 9) -> dict[str, float]:
     )
     snapshot = PolicySnapshot(0, layers, nominal_rest_length(settings.robot), 0.2)
     shares: dict[float, list[tuple[float, float]]] = {0.0: [], 1.0: []}
-    with _TimedSimulation(settings.robot) as simulation:
-        for difficulty, found in shares.items():
+    with _TimedEngine(PyBulletEngine(settings.robot)) as engine:
+        for difficulty, measured in shares.items():
             for seed in range(repeats + 1):
                 plan = EpisodePlan(seed, 0, seed, seed, 250, seed, difficulty, 0.15, 0)
-                simulation.steps_s = simulation.ground_s = 0.0
-                total_s = _seconds(partial(rollout, simulation, settings, plan, snapshot))
-                steps_s, ground_s = simulation.steps_s, simulation.ground_s
-                found.append(((total_s - steps_s - ground_s) / steps_s, ground_s / steps_s))
-    flat, rough = (np.median(found[1:], axis=0) for found in shares.values())  # the first one warms up
+                engine.steps_s = engine.ground_s = 0.0
+                total_s = _seconds(partial(rollout, engine, settings, plan, snapshot))
+                steps_s, ground_s = engine.steps_s, engine.ground_s
+                measured.append(((total_s - steps_s - ground_s) / steps_s, ground_s / steps_s))
+    flat, rough = (np.median(measured[1:], axis=0) for measured in shares.values())  # the first one warms up
     return {
         "episode_overhead_share": float(flat[0]),
         "rough_episode_overhead_share": float(rough[0]),
@@ -119,9 +133,9 @@ def physics_speed(repeats: int = 30) -> dict[str, float]:
     rng = np.random.default_rng(0)
     spent: dict[str, list[float]] = {"flat": [], "rough": [], "reference": [], "bare": []}
     with (
-        Simulation(robot, "plugin") as flat,
-        Simulation(robot, "plugin") as rough,
-        Simulation(robot, "reference") as plain,
+        PyBulletEngine(robot, "plugin") as flat,
+        PyBulletEngine(robot, "plugin") as rough,
+        PyBulletEngine(robot, "reference") as plain,
     ):
         low, high = robot.shortest_command_m, robot.longest_command_m
         for number, steps_n in enumerate([_WARM_UP_STEPS_N] + [_STEPS_N] * repeats):

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.storage.schema import EPISODES, FRAMES, vector_length
 from t6gps.workers.episode.task import running_cost
-from t6gps.workers.physics.simulation import CONTROL_STEP_S
+from t6gps.workers.physics.engine import CONTROL_STEP_S
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, exit_edge
 from t6gps.workers.robot.symmetry import CABLES_FROM, NODES_FROM, world_map

@@ -3,19 +3,22 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from t6gps.storage.errors import PhysicsError
 from t6gps.workers.ground.terrain import generate
-from t6gps.workers.physics import simulation
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.bullet_hooks import overrides
-from t6gps.workers.physics.simulation import Simulation, neutral_state
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings
 
@@ -90,12 +93,12 @@ def _motion() -> Array:
     """Positions of the bars over 2 s on three rough grounds and on the plane [4, 20, 6, 3] (m)."""
     rng = np.random.default_rng(3)
     motions = []
-    with Simulation(RobotSettings()) as simulation:
+    with PyBulletEngine(RobotSettings()) as engine:
         for terrain in [*(generate(seed, 1.0) for seed in range(3)), None]:
-            simulation.set_ground(terrain)
-            simulation.reset(neutral_state(simulation.robot, 1.9))
+            engine.set_ground(terrain)
+            engine.reset(neutral_state(engine.robot, 1.9))
             commands = rng.uniform(0.5, 1.5, (20, CABLES_N))
-            motions.append([simulation.control_step(command).bar_positions for command in commands])
+            motions.append([engine.control_step(command).bar_positions for command in commands])
     return np.array(motions)
 
 
@@ -144,18 +147,29 @@ def _motions() -> dict[str, Array]:
 
 def test_motion_is_that_of_bullet_alone(tmp_path: Path) -> None:
     assert overrides.take_over()
-    subprocess.run([sys.executable, __file__, tmp_path / "own.npz"], check=True)
-    with np.load(tmp_path / "own.npz") as own:
+    bare = {**os.environ, "T6GPS_PHYSICS": "bullet"}
+    subprocess.run([sys.executable, __file__, tmp_path / "bare.npz"], env=bare, check=True)
+    with np.load(tmp_path / "bare.npz") as motions:
         for name, motion in _motions().items():
-            assert np.abs(own[name] - motion).max() < 1e-9, name
+            assert np.abs(motions[name] - motion).max() < 1e-9, name
+
+
+def test_overrides_say_whether_they_are_active_and_exclude_bullet_alone() -> None:
+    assert overrides.take_over()
+    assert overrides.active() == {"contacts": True, "solver": True}
+    with pytest.raises(PhysicsError, match="has overridden its contacts and its solver; set the variable before"):
+        PyBulletEngine(RobotSettings(), "bullet")
 
 
 def test_a_library_without_bullet_has_none_of_its_symbols() -> None:
     path = overrides.library_path()
     assert path is not None
-    assert set(overrides._symbols(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {"closest_points"}
+    assert set(overrides.symbol_values(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {
+        "closest_points"
+    }
 
 
 if __name__ == "__main__":
-    simulation.take_over = lambda: False
+    assert not any(overrides.active().values())
     np.savez(sys.argv[1], **_motions())
+    assert not any(overrides.active().values())
