@@ -17,7 +17,10 @@ from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings
 
 _STEPS_N = 10
+"""Few enough that contact chaos does not part the engines."""
+
 _LARGEST_DIFFERENCE_M = 0.1
+"""Centres of mass farther apart mean that the engines did not do the same work."""
 
 
 class _NativeMujoco:

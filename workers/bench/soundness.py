@@ -14,6 +14,7 @@ from t6gps.workers.robot.topology import CABLES, CABLES_N
 from t6gps.workers.settings import RobotSettings
 
 EPISODE_STEPS = 250
+"""Control steps T of an episode (paper Sec. IV-A)."""
 
 _WIDEST = RobotSettings(shortest_command_m=0.4, longest_command_m=1.6, winch_speed_m_per_s=2.0)
 EXTREME_ROBOTS = tuple(

@@ -292,9 +292,9 @@ def test_a_missing_plugin_is_named_with_its_remedy(tmp_path: Path) -> None:
 
 
 def test_a_library_without_bullets_functions_is_refused_with_their_name() -> None:
-    with PyBulletEngine(ROBOT, "reference") as engine:
-        with pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand"):
-            plugin.PluginStepper(engine.client, ROBOT, 25, bullet_library=str(plugin.library_path()))
+    refusal = pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand")
+    with PyBulletEngine(ROBOT, "reference") as engine, refusal:
+        plugin.PluginStepper(engine.client, ROBOT, 25, bullet_library=str(plugin.library_path()))
 
 
 @pytest.mark.parametrize("command", [np.full(CABLES_N, np.nan), np.ones(23)], ids=["not finite", "wrong length"])

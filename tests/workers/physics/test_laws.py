@@ -3,9 +3,7 @@
 import numpy as np
 import pytest
 
-from t6gps.storage.errors import PhysicsError
 from t6gps.workers.bench.soundness import EXTREME_ROBOTS, extremes
-from t6gps.workers.episode.stance import check_robot
 from t6gps.workers.episode.start import random_start, turn
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.physics.bullet import pybullet
@@ -117,21 +115,3 @@ def test_the_widest_commands_on_the_roughest_ground_stay_sound(robot: RobotSetti
     assert found["fastest_com_m_per_s"] < 8
     assert found["fastest_spin_rad_per_s"] < 100
     assert found["longest_cable_m"] < BAR_LENGTH_M + 0.1
-
-
-@pytest.mark.parametrize("stiffness_n_per_m", [1000.0, 2000.0, 4000.0])
-def test_the_published_robots_stand(stiffness_n_per_m: float) -> None:
-    check_robot(RobotSettings(cable_stiffness_n_per_m=stiffness_n_per_m))
-
-
-@pytest.mark.parametrize(
-    ("robot", "words"),
-    [
-        (RobotSettings(bar_mass_kg=20.0), "collapses: the CoM settles at 0.4"),
-        (RobotSettings(cable_stiffness_n_per_m=500.0, pretension_n=50.0), "raise robot.pretension_n"),
-        (RobotSettings(cable_stiffness_n_per_m=500.0, pretension_n=400.0), "need rest lengths of 0.388 m"),
-    ],
-)
-def test_a_robot_that_cannot_stand_is_refused(robot: RobotSettings, words: str) -> None:
-    with pytest.raises(PhysicsError, match=words):
-        check_robot(robot)
