@@ -34,6 +34,7 @@ from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 
 Floats = NDArray[np.float32]
+Info = dict[str, Any]
 
 ENVIRONMENT_ID = "t6gps/SuperBall-v0"
 EPISODE_STEPS = 250
@@ -83,7 +84,7 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         self._engine = PyBulletEngine(self._settings.robot)
         self._episode: RunningEpisode | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
         """Start an episode. `seed` decides start, course and ground; without it they are drawn.
 
         The option `terrain_seed` sets the ground apart from the rest, as the plan of a recorded episode does. `info`
@@ -105,7 +106,7 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         self._episode = episode
         return episode.observation, {"seed": seed, "terrain_seed": terrain_seed, **_info(episode)}
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, Info]:
         """Command the rest lengths that `action` [24] stands for during one control step.
 
         Where the simulation leaves the range of sound states, the episode terminates, `info["ended_by"]` says why,
@@ -135,7 +136,7 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         self._engine.close()
 
 
-def _info(episode: RunningEpisode) -> dict[str, Any]:
+def _info(episode: RunningEpisode) -> Info:
     return {
         "forward_speed_m_per_s": float(episode.state.com_velocity[:2] @ np.array(episode.target)),
         "waypoints_reached": episode.course.reached,

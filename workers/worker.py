@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -20,6 +19,8 @@ from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings
 
 LAST_STATES_N = 5
+"""Half a second: enough to see where a failed episode was heading."""
+
 RANDOMISATION_STREAM = 3
 """Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
 
@@ -50,7 +51,7 @@ class RolloutWorker:
         settings = self._settings.model_copy(update={"robot": robot})
         return rollout(self._engine, settings, plan, snapshot, delay_steps, self._record)
 
-    def position(self) -> tuple[int, list[dict[str, Any]]]:
+    def position(self) -> tuple[int, list[dict[str, object]]]:
         """Control step of the newest episode, and its last states: where it stands, or where it failed."""
         states = self._record.states[-LAST_STATES_N:]
         return len(self._record.actions), [

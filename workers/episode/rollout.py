@@ -59,14 +59,7 @@ def controlled(
     `version` goes into the tables as the policy's, observed rest lengths are centred on `nominal_m`.
     """
     episode = RunningEpisode(
-        engine,
-        settings,
-        plan.seed,
-        plan.terrain_seed,
-        plan.terrain_difficulty,
-        nominal_m,
-        delay_steps,
-        plan.index,
+        engine, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, nominal_m, delay_steps, plan.index
     )
     noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation, plan.steps)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
@@ -88,7 +81,12 @@ def controlled(
         record.means.append(mean)
         record.actions.append(action)
         _keep(record, episode)
-    outcome = Outcome(version, ended_by, episode.course.reached, delay_steps)
+    outcome = Outcome(
+        policy_version=version,
+        ended_by=ended_by,
+        waypoints_reached=episode.course.reached,
+        delay_steps=delay_steps,
+    )
     return to_episode(record, plan, outcome, settings)
 
 

@@ -24,7 +24,7 @@ SHAPE_SPREAD_M = 0.15
 """Initial rest lengths are uniform within this distance of the nominal one."""
 
 CLEARANCE_M = 0.05
-"""Free height below the lowest point of a bar: the fall starts slow, whatever lies between the points looked up."""
+"""Free height below the bars: ground between the points looked up may stand out by as much."""
 
 SETTLE_STEPS = 15
 """After 1.5 s the robot lies on the ground in a shape of its own."""

@@ -26,10 +26,13 @@ from t6gps.workers.settings import RobotSettings
 
 START_CLEARANCE_M = 0.1
 """Height of the lowest node's centre line above the highest ground below the initial state (m)."""
+
 GROUND_DEPTH_M = 2.0
 """Thickness of rough ground below its lowest point (m)."""
 
-_BAR_COLOR, _CABLE_COLOR, _GROUND_COLOR = "0.25 0.25 0.3 1", "0.75 0.2 0.15 1", "0.8 0.78 0.72 1"
+_BAR_COLOR = "0.25 0.25 0.3 1"
+_CABLE_COLOR = "0.75 0.2 0.15 1"
+_GROUND_COLOR = "0.8 0.78 0.72 1"
 
 
 def to_mjcf(robot: RobotSettings, terrain: Terrain | None = None) -> str:

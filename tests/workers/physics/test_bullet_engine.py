@@ -155,9 +155,9 @@ def _angular_momentum(state: RobotState, robot: RobotSettings) -> Array:
     axes = (nodes[0::2] - nodes[1::2]) / BAR_LENGTH_M
     spin = (state.bar_angular_velocities * axes).sum(axis=1, keepdims=True) * axes
     transverse = robot.bar_mass_kg * BAR_LENGTH_M**2 / 12
-    own = transverse * (state.bar_angular_velocities - spin) + robot.axial_inertia_kg_m2 * spin
+    spins = transverse * (state.bar_angular_velocities - spin) + robot.axial_inertia_kg_m2 * spin
     orbit = np.cross(state.bar_positions - state.com, state.bar_velocities - state.com_velocity)
-    return np.asarray((own + robot.bar_mass_kg * orbit).sum(axis=0))
+    return np.asarray((spins + robot.bar_mass_kg * orbit).sum(axis=0))
 
 
 def test_free_flight_keeps_angular_momentum() -> None:

@@ -47,12 +47,12 @@ class _Closest(ctypes.Structure):
 
 def _closest(start: Array, along: Array, corners: Array, reach_m: float = np.inf) -> _Closest | None:
     """Closest points of a segment and a triangle, None if they are farther apart than `reach_m`."""
-    padded, found = np.zeros((3, 4)), _Closest()
+    padded, closest = np.zeros((3, 4)), _Closest()
     padded[:, :3] = corners
     pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (start, along, padded)]
     library = ctypes.CDLL(str(overrides.library_path()))
-    near = library.closest_points(*pointers, ctypes.c_double(reach_m), ctypes.byref(found))
-    return found if near else None
+    near = library.closest_points(*pointers, ctypes.c_double(reach_m), ctypes.byref(closest))
+    return closest if near else None
 
 
 def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
@@ -62,15 +62,15 @@ def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
     for _ in range(300):
         start, along, corners = rng.normal(size=3), rng.normal(size=3), rng.normal(size=(3, 3))
         sampled = _distances(start + shares * along, corners).min()
-        found = _closest(start, along, corners)
-        assert found is not None
-        distance = np.sqrt(found.distance2)
+        closest = _closest(start, along, corners)
+        assert closest is not None
+        distance = np.sqrt(closest.distance2)
         step = np.linalg.norm(along) / 2000  # no point of the segment is farther from a sampled one
         assert sampled - step - 1e-9 <= distance <= sampled + 1e-9
         if distance == 0:
             crossing += 1
             continue
-        on_segment, on_triangle = np.array(found.on_segment), np.array(found.on_triangle)
+        on_segment, on_triangle = np.array(closest.on_segment), np.array(closest.on_triangle)
         assert np.isclose(np.linalg.norm(on_segment - on_triangle), distance, rtol=1e-12, atol=0)
         assert _distances(on_triangle[None], corners)[0] < 1e-12
         share = (on_segment - start) @ along / (along @ along)
@@ -84,9 +84,9 @@ def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
 def test_a_segment_along_a_triangle_has_its_distance() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     for y in (0.2, 0.0):  # over the middle of the triangle, and over one of its edges
-        found = _closest(np.array([-5.0, y, 0.04]), np.array([10.0, 0.0, 0.0]), corners)
-        assert found is not None
-        assert np.isclose(np.sqrt(found.distance2), 0.04, rtol=1e-12)
+        closest = _closest(np.array([-5.0, y, 0.04]), np.array([10.0, 0.0, 0.0]), corners)
+        assert closest is not None
+        assert np.isclose(np.sqrt(closest.distance2), 0.04, rtol=1e-12)
 
 
 def _motion() -> Array:
@@ -164,9 +164,8 @@ def test_overrides_say_whether_they_are_active_and_exclude_bullet_alone() -> Non
 def test_a_library_without_bullet_has_none_of_its_symbols() -> None:
     path = overrides.library_path()
     assert path is not None
-    assert set(overrides.symbol_values(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {
-        "closest_points"
-    }
+    names = ["closest_points", "_ZTV24btConvexTriangleCallback"]
+    assert set(overrides.symbol_values(path, names)) == {"closest_points"}
 
 
 if __name__ == "__main__":

@@ -118,8 +118,8 @@ def rough_fall(engines: Engines, seed: int) -> float:
     nodes = state.nodes()
     lift = (ROUGH.height(nodes[:, 0], nodes[:, 1]) - nodes[:, 2]).max() + 0.2
     start = state.but(bar_positions=state.bar_positions + [0.0, 0.0, lift])
-    one, other = (_motion(engine, start, np.tile(HOLD, (10, 1)))[-1].com for engine in engines)
-    return float(np.linalg.norm(one - other))
+    bullet, second = (_motion(engine, start, np.tile(HOLD, (10, 1)))[-1].com for engine in engines)
+    return float(np.linalg.norm(bullet - second))
 
 
 # Agreement of the engines
@@ -136,9 +136,9 @@ def test_flight_with_slack_cables_agrees_to_rounding(engines: Engines, seed: int
     )
     assert (tensions(start, ROBOT)[0] == 0.0).sum() >= 5
     commands = rng.uniform(ROBOT.shortest_command_m, ROBOT.longest_command_m, (10, CABLES_N))
-    one, other = (_motion(engine, start, commands)[-1] for engine in engines)
-    np.testing.assert_allclose(other.nodes(), one.nodes(), atol=1e-11)
-    np.testing.assert_allclose(other.node_velocities(), one.node_velocities(), atol=1e-10)
+    bullet, second = (_motion(engine, start, commands)[-1] for engine in engines)
+    np.testing.assert_allclose(second.nodes(), bullet.nodes(), atol=1e-11)
+    np.testing.assert_allclose(second.node_velocities(), bullet.node_velocities(), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -333,8 +333,8 @@ def test_eval_runs_on_the_second_engine(tmp_path: Path) -> None:
     settings = [f"--set={item}" for item in tiny]
     _t6gps("train", "flat-quick", "--run", "tiny", "--serial", "--root", tmp_path, *settings)
     arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", tmp_path)
-    one = json.loads(_t6gps(*arguments).stdout)
-    other = json.loads(_t6gps(*arguments, "--engine", "mujoco").stdout)
-    assert one.keys() == other.keys()
-    assert one["cost"] != other["cost"]
-    assert one["cost"]["mean"] == pytest.approx(other["cost"]["mean"], abs=0.2)
+    bullet = json.loads(_t6gps(*arguments).stdout)
+    second = json.loads(_t6gps(*arguments, "--engine", "mujoco").stdout)
+    assert bullet.keys() == second.keys()
+    assert bullet["cost"] != second["cost"]
+    assert bullet["cost"]["mean"] == pytest.approx(second["cost"]["mean"], abs=0.2)
