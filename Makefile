@@ -14,7 +14,7 @@ export MKL_NUM_THREADS = 1
 
 install: $(STAMP)
 
-$(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch])
+$(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch] */*/*/native/*.[ch])
 	test -d $(VENV) || $(PYTHON) -m venv $(VENV)
 	$(BIN)/pip install --quiet --disable-pip-version-check --editable '.[dev]'
 	touch $(STAMP)

@@ -62,8 +62,8 @@ class Config(RolloutSettings):
         return RolloutSettings(**{name: getattr(self, name) for name in RolloutSettings.model_fields})
 
     def to_json(self) -> str:
-        """The configuration as the run keeps it."""
-        return self.model_dump_json(indent=2) + "\n"
+        """The configuration as the run keeps it; options that are none are left out."""
+        return self.model_dump_json(indent=2, exclude_none=True) + "\n"
 
 
 def presets() -> list[str]:
@@ -93,7 +93,7 @@ def load(source: str, overrides: Sequence[str] = ()) -> Config:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source} is not TOML: {error}; correct the file") from None
-    return _checked_learner(_checked_world(_validated(_overridden(values, overrides), source)), source)
+    return _checked_learner(_with_whole_paths(_validated(_overridden(values, overrides), source)), source)
 
 
 def _checked_learner(config: Config, where: str) -> Config:
@@ -104,35 +104,20 @@ def _checked_learner(config: Config, where: str) -> Config:
             f"{where}: learner.horizon_steps = {horizon} is longer than an episode of run.steps = {steps}; "
             "allowed: at most as long; lower the first or raise the second"
         )
-    if config.learner.localization is Localization.TIME and not config.task.directions:
+    if config.learner.localization is Localization.TIME and config.task.directions is None:
         raise ConfigError(
-            f"{where}: learner.localization = time needs a common start, found task.directions = 0; "
+            f"{where}: learner.localization = time needs a common start, found no task.directions; "
             "set task.directions to the number of directions, 36 for example"
         )
     return config
 
 
-def _checked_world(config: Config) -> Config:
-    """The configuration, its robot seen to stand and its ground's file, if any, seen to be ground; with its whole path.
-
-    PhysicsError or TerrainError otherwise.
-    """
-    from t6gps.workers.episode.start import check_stance
-    from t6gps.workers.ground.ground import ground
-
-    check_stance(config.robot)
-    spread = config.randomisation
-    weakest = {
-        "bar_mass_kg": config.robot.bar_mass_kg * (1 + spread.mass_spread),
-        "cable_stiffness_n_per_m": config.robot.cable_stiffness_n_per_m * (1 - spread.stiffness_spread),
-    }
-    if spread.mass_spread or spread.stiffness_spread:
-        check_stance(config.robot.model_copy(update=weakest))
-    if not config.terrain.file:
+def _with_whole_paths(config: Config) -> Config:
+    """The configuration with the whole path of its ground's file, so that a run finds it from any folder."""
+    if config.terrain.file is None:
         return config
-    terrain = config.terrain.model_copy(update={"file": str(Path(config.terrain.file).resolve())})
-    ground(terrain, 0, terrain.difficulty)
-    return config.model_copy(update={"terrain": terrain})
+    file = str(Path(config.terrain.file).resolve())
+    return config.model_copy(update={"terrain": config.terrain.model_copy(update={"file": file})})
 
 
 def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") -> Config:
@@ -144,7 +129,7 @@ def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") 
     if isinstance(values, dict) and isinstance(values.get("learner"), dict):
         values["learner"].setdefault("observation", "sensors")  # runs of before there was a choice
     config = _validated(_overridden(values, overrides), where)
-    return _checked_world(config) if overrides else config
+    return _with_whole_paths(config) if overrides else config
 
 
 def differences(stored: Config, wanted: Config) -> list[str]:

@@ -52,6 +52,19 @@ def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None
 
 
 @pytest.mark.slow
+def test_the_wheel_is_typed_compiled_modules_included(wheel: Path) -> None:
+    names = set(zipfile.ZipFile(wheel).namelist())
+    for room in ("storage", "workers", "learner", "service"):
+        assert f"t6gps/{room}/py.typed" in names
+        for stub in (REPOSITORY / room).rglob("*.pyi"):
+            assert f"t6gps/{stub.relative_to(REPOSITORY)}" in names
+    for module in SETUPTOOLS["ext-modules"]:
+        stub_name = f"{module['name'].replace('.', '/')}.pyi"
+        is_imported = b"PyInit_" in b"".join((REPOSITORY / source).read_bytes() for source in module["sources"])
+        assert (stub_name in names) == is_imported
+
+
+@pytest.mark.slow
 def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     # Without site (-S) the editable installation of this environment is not found; its dependencies still are.

@@ -23,15 +23,18 @@ except ModuleNotFoundError as error:
 from t6gps.storage.errors import DataError, UnsoundStateError
 from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
 from t6gps.workers.episode.running import RunningEpisode
-from t6gps.workers.episode.start import check_stance
+from t6gps.workers.episode.stance import check_stance
 from t6gps.workers.episode.task import running_cost
-from t6gps.workers.physics.simulation import FASTEST_SOUND_M_PER_S, Simulation, nominal_rest_length
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.limits import FASTEST_SOUND_M_PER_S
+from t6gps.workers.robot.neutral import nominal_rest_length
 from t6gps.workers.robot.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE, REST_LENGTH_SCALE_M
 from t6gps.workers.robot.symmetry import CABLE_MAP
 from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 
 Floats = NDArray[np.float32]
+Info = dict[str, Any]
 
 ENVIRONMENT_ID = "t6gps/SuperBall-v0"
 EPISODE_STEPS = 250
@@ -77,11 +80,11 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         self._half_range_m = (self._settings.robot.longest_command_m - self._settings.robot.shortest_command_m) / 2
         self.observation_space = _observation_space(self._settings.robot)
         self.action_space = gymnasium.spaces.Box(-1.0, 1.0, (CABLES_N,))
-        check_stance(self._settings.robot)
-        self._simulation = Simulation(self._settings.robot)
+        check_stance(self._settings)
+        self._engine = PyBulletEngine(self._settings.robot)
         self._episode: RunningEpisode | None = None
 
-    def reset(self, *, seed: int | None = None, options: dict[str, Any] | None = None) -> tuple[Floats, dict[str, Any]]:
+    def reset(self, *, seed: int | None = None, options: Info | None = None) -> tuple[Floats, Info]:
         """Start an episode. `seed` decides start, course and ground; without it they are drawn.
 
         The option `terrain_seed` sets the ground apart from the rest, as the plan of a recorded episode does. `info`
@@ -98,12 +101,12 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
         settings = self._settings
         nominal_m = nominal_rest_length(settings.robot)
         episode = RunningEpisode(
-            self._simulation, settings, seed, terrain_seed, settings.terrain.difficulty, nominal_m, number=seed
+            self._engine, settings, seed, terrain_seed, settings.terrain.difficulty, nominal_m, number=seed
         )
         self._episode = episode
         return episode.observation, {"seed": seed, "terrain_seed": terrain_seed, **_info(episode)}
 
-    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, dict[str, Any]]:
+    def step(self, action: Floats) -> tuple[Floats, float, bool, bool, Info]:
         """Command the rest lengths that `action` [24] stands for during one control step.
 
         Where the simulation leaves the range of sound states, the episode terminates, `info["ended_by"]` says why,
@@ -130,10 +133,10 @@ class SuperBallEnvironment(gymnasium.Env[Floats, Floats]):
     def close(self) -> None:
         """Release the simulator; a second call does nothing."""
         self._episode = None
-        self._simulation.close()
+        self._engine.close()
 
 
-def _info(episode: RunningEpisode) -> dict[str, Any]:
+def _info(episode: RunningEpisode) -> Info:
     return {
         "forward_speed_m_per_s": float(episode.state.com_velocity[:2] @ np.array(episode.target)),
         "waypoints_reached": episode.course.reached,

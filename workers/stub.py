@@ -12,17 +12,21 @@ import os
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
+from numpy.typing import NDArray
 
 from t6gps.storage import schema
 from t6gps.storage.errors import ConfigError, PhysicsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.physics.bullet import pybullet
 
+Known = dict[str, int | float | NDArray[np.int64]]
+"""Columns that are not random, by name: one value for all rows, or a value for each."""
+
 ENDLESS_STEPS_N = 2**31 - 1
+"""The most that Bullet takes."""
 
 
 class StubWorker:
@@ -43,7 +47,7 @@ class StubWorker:
         self._step = plan.steps // 2
         return ORDERS.get(order, episode)(plan, snapshot)
 
-    def position(self) -> tuple[int, list[dict[str, Any]]]:
+    def position(self) -> tuple[int, list[dict[str, object]]]:
         """Control step, and no states: there is no robot."""
         return self._step, []
 
@@ -68,12 +72,13 @@ class StubWorker:
 
 
 SLOW_FACTOR = 10
+"""An episode ordered to be slow takes this many times as long."""
 
 
 def episode(plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
     """A sound episode of random numbers that depends on the plan and the policy's version alone."""
     rng = np.random.default_rng(plan.seed)
-    known: dict[str, object] = {
+    known: Known = {
         "episode_id": plan.episode_id,
         "iteration": plan.iteration,
         "index": plan.index,
@@ -155,7 +160,7 @@ ORDERS: dict[str, Callable[[EpisodePlan, PolicySnapshot], Episode]] = {
 }
 
 
-def _table(definition: pa.Schema, rows: int, known: dict[str, Any], rng: np.random.Generator) -> pa.Table:
+def _table(definition: pa.Schema, rows: int, known: Known, rng: np.random.Generator) -> pa.Table:
     columns = []
     for field in definition:
         length = schema.vector_length(field)

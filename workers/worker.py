@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import Any
 
 import numpy as np
 
@@ -13,11 +12,15 @@ from t6gps.workers.episode import policy
 from t6gps.workers.episode.randomisation import draw
 from t6gps.workers.episode.recording import Record
 from t6gps.workers.episode.rollout import rollout
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.episode.stance import check_stance
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.engine import Engine
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings
 
 LAST_STATES_N = 5
+"""Half a second: enough to see where a failed episode was heading."""
+
 RANDOMISATION_STREAM = 3
 """Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
 
@@ -25,15 +28,15 @@ RANDOMISATION_STREAM = 3
 class RolloutWorker:
     """Runs episodes one after the other; each depends on its plan and policy alone.
 
-    `simulation` makes the simulator: PyBullet, or another engine with the same interface.
+    `engine` makes the simulator of a robot: PyBullet, or another engine. Raises PhysicsError for a robot that cannot
+    stand, and TerrainError for a file that is no ground.
     """
 
-    def __init__(
-        self, settings: RolloutSettings, simulation: Callable[[RobotSettings], Simulation] = Simulation
-    ) -> None:
+    def __init__(self, settings: RolloutSettings, engine: Callable[[RobotSettings], Engine] = PyBulletEngine) -> None:
+        check_stance(settings)
         self._settings = settings
-        self._make_simulation = simulation
-        self._simulation = simulation(settings.robot)
+        self._make_engine = engine
+        self._engine = engine(settings.robot)
         self._record = Record()
 
     def run(self, plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
@@ -42,13 +45,13 @@ class RolloutWorker:
         policy.check(snapshot, (SENSORS_N, OBSERVATION_N), CABLES_N)
         rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(RANDOMISATION_STREAM,)))
         robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
-        if robot != self._simulation.robot:
-            self._simulation.close()
-            self._simulation = self._make_simulation(robot)
+        if robot != self._engine.robot:
+            self._engine.close()
+            self._engine = self._make_engine(robot)
         settings = self._settings.model_copy(update={"robot": robot})
-        return rollout(self._simulation, settings, plan, snapshot, delay_steps, self._record)
+        return rollout(self._engine, settings, plan, snapshot, delay_steps, self._record)
 
-    def position(self) -> tuple[int, list[dict[str, Any]]]:
+    def position(self) -> tuple[int, list[dict[str, object]]]:
         """Control step of the newest episode, and its last states: where it stands, or where it failed."""
         states = self._record.states[-LAST_STATES_N:]
         return len(self._record.actions), [
@@ -57,4 +60,4 @@ class RolloutWorker:
 
     def close(self) -> None:
         """Release the simulator."""
-        self._simulation.close()
+        self._engine.close()

@@ -15,7 +15,8 @@ from t6gps.storage import spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.engine import Engine
 from t6gps.workers.settings import RobotSettings
 from t6gps.workers.worker import RolloutWorker
 
@@ -27,7 +28,7 @@ class SerialExecutor(Executor):
         self,
         config: Config,
         run: Run | None = None,
-        simulation: Callable[[RobotSettings], Simulation] = Simulation,
+        simulation: Callable[[RobotSettings], Engine] = PyBulletEngine,
     ) -> None:
         super().__init__(config, run)
         self._worker = RolloutWorker(config.rollout, simulation)

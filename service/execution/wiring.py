@@ -6,7 +6,8 @@ from typing import Any
 
 from t6gps.learner.learner import Learner
 from t6gps.service.config import Config
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, nominal_rest_length
+from t6gps.workers.physics.engine import CONTROL_STEP_S
+from t6gps.workers.robot.neutral import nominal_rest_length
 from t6gps.workers.robot.symmetry import CABLE_MAP, PROPER
 
 ACTION_SCALE_M = 0.2

@@ -26,7 +26,8 @@ from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.records import EpisodePlan
 from t6gps.workers.episode import gaits
 from t6gps.workers.episode.rollout import Controller, controlled
-from t6gps.workers.physics.simulation import Simulation, nominal_rest_length
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.robot.neutral import nominal_rest_length
 
 Array = NDArray[np.float64]
 Progress = Callable[[int, int], None]
@@ -63,7 +64,7 @@ def evaluate(peer: Peer, this: Run, overrides: Sequence[str], serial: bool) -> E
     control = gaits.flop(nominal_m) if peer is Peer.FLOP else gaits.waves(nominal_m, _kept_gait(this))
     size = config.run
     plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
-    with Simulation(config.robot) as simulation:
+    with PyBulletEngine(config.robot) as simulation:
         summaries = [controlled(simulation, config.rollout, plan, control, 0, nominal_m).summary for plan in plans]
     return evaluation.summarise(summaries, size.seed)
 
@@ -88,7 +89,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
         raise RunError(f"{steps} steps make up no generation of {OFFSPRING_N} x {EVOLUTION_STEPS}; allow more steps")
     rng = np.random.default_rng(np.random.SeedSequence(config.run.seed, spawn_key=(PEERS_STREAM,)))
     settings = config.rollout
-    terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": ""})
+    terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": None})
     settings = settings.model_copy(
         update={"task": settings.task.model_copy(update={"directions": 1}), "terrain": terrain}
     )
@@ -96,7 +97,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
     plan = EpisodePlan(0, 0, 0, 0, EVOLUTION_STEPS, 0, 0.0, 0.0, 0)
     mean, spread = np.zeros(gaits.WAVE_PARAMETERS_N), FIRST_SPREAD
     best, fastest = mean, -np.inf
-    with Simulation(config.robot) as simulation:
+    with PyBulletEngine(config.robot) as simulation:
 
         def speed(parameters: Array) -> float:
             control: Controller = gaits.waves(nominal_m, parameters)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import signal
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from contextlib import closing
 from enum import StrEnum
 from pathlib import Path
@@ -18,10 +18,11 @@ from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.views import terminal
 from t6gps.storage import catalog, checkpoint
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import RunError
+from t6gps.storage.errors import PhysicsError, RunError, TerrainError
 
 if TYPE_CHECKING:
-    from t6gps.workers.physics.simulation import Simulation
+    from t6gps.workers.physics import engine as physics
+    from t6gps.workers.settings import RobotSettings
 
 
 class Engine(StrEnum):
@@ -32,7 +33,13 @@ class Engine(StrEnum):
 
 
 def start_executor(config: Config, serial: bool, this: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
-    """Workers and learner: on Ray, or in this process when `serial` or with another engine; of the run that trains."""
+    """Workers and learner: on Ray, or in this process when `serial` or with another engine; of the run that trains.
+
+    PhysicsError or TerrainError for a world that no worker can start in.
+    """
+    from t6gps.workers.episode.stance import check_stance
+
+    check_stance(config.rollout)
     executor: Executor
     if serial or engine is Engine.MUJOCO:
         from t6gps.service.execution.serial import SerialExecutor
@@ -51,14 +58,14 @@ def _heed_sigterm() -> None:
     signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
-def _simulation(engine: Engine) -> type[Simulation]:
+def _simulation(engine: Engine) -> Callable[[RobotSettings], physics.Engine]:
     if engine is Engine.MUJOCO:
-        from t6gps.workers.physics.mujoco_engine import MujocoSimulation
+        from t6gps.workers.physics.mujoco_engine import MujocoEngine
 
-        return MujocoSimulation
-    from t6gps.workers.physics.simulation import Simulation
+        return MujocoEngine
+    from t6gps.workers.physics.bullet_engine import PyBulletEngine
 
-    return Simulation
+    return PyBulletEngine
 
 
 def check_unchanged(this: Run, config: Config, remedy: str) -> None:
@@ -80,7 +87,7 @@ def complete(config: Config, this: Run, serial: bool) -> tuple[Evaluation, list[
     with catalog.locked(this):
         try:
             started = start_executor(config, serial, this)
-        except RunError:
+        except (RunError, PhysicsError, TerrainError):
             catalog.discard_unused(this)
             raise
         with closing(started) as executor:

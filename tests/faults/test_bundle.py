@@ -20,7 +20,7 @@ from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import PhysicsError, RunError
 from t6gps.workers.episode.start import SETTLE_STEPS
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.robot.state import Array, RobotState
 
 POISON, STEP = 1, 7
@@ -30,7 +30,7 @@ CONFIG = {
 }
 
 
-class Tripping(Simulation):
+class Tripping(PyBulletEngine):
     """Fails in the poison episode's step STEP, whenever that is run."""
 
     armed = False

@@ -2,6 +2,7 @@
 
 import json
 from pathlib import Path
+from typing import get_args
 
 import pytest
 
@@ -112,3 +113,17 @@ def test_differences_name_the_key_and_both_values_and_ignore_the_number_of_worke
     b = load("flat-quick", ["run.workers=7", "learner.kl_weight=0.5"])
     assert differences(a, b) == [f"learner.kl_weight = 0.5 (the run has {a.learner.kl_weight})"]
     assert configuration.differences(a, a) == []
+
+
+def test_an_option_that_may_be_none_is_none_by_default_so_that_a_run_can_leave_it_out() -> None:
+    assert "null" not in Config().to_json()
+    for section in Config.model_fields:
+        settings = getattr(Config(), section)
+        for key, field in type(settings).model_fields.items():
+            if type(None) in get_args(field.annotation):
+                assert getattr(settings, key) is None, key
+
+
+def test_loading_simulates_nothing() -> None:
+    assert load("flat-quick", ["robot.bar_mass_kg=20"]).robot.bar_mass_kg == 20.0
+    assert load("flat-quick", ["terrain.file=none.stl"]).terrain.file == str(Path("none.stl").resolve())

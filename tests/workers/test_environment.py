@@ -18,7 +18,7 @@ from t6gps.storage import schema
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 from t6gps.workers.environment import ENVIRONMENT_ID, EPISODE_STEPS, SuperBallEnvironment
-from t6gps.workers.physics import simulation
+from t6gps.workers.robot.neutral import nominal_rest_length
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 from t6gps.workers.worker import RolloutWorker
 
@@ -82,9 +82,7 @@ def test_the_actions_of_a_rollout_repeat_it_to_the_last_bit(difficulty: float) -
     layers = ((0.3 * rng.standard_normal((24, 47)).astype(np.float32), np.zeros(24, np.float32)),)
     plan = EpisodePlan(0, 0, 0, 5, 60, terrain_seed=3, terrain_difficulty=difficulty, noise_std_m=0.0, policy_version=0)
     worker = RolloutWorker(RolloutSettings())
-    episode = worker.run(
-        plan, PolicySnapshot(0, layers, offset_m=simulation.nominal_rest_length(RobotSettings()), scale_m=0.2)
-    )
+    episode = worker.run(plan, PolicySnapshot(0, layers, offset_m=nominal_rest_length(RobotSettings()), scale_m=0.2))
     worker.close()
     frames = episode.frames
     recorded = schema.array(frames, "action").astype(np.float64)
@@ -166,16 +164,27 @@ def test_an_episode_is_truncated_after_t_steps_and_not_before() -> None:
     assert flags == [(False, False)] * (EPISODE_STEPS - 1) + [(False, True)]
 
 
-def test_leaving_the_sound_states_terminates_says_why_and_never_pays(monkeypatch: pytest.MonkeyPatch) -> None:
-    task = TaskSettings(target_speed_m_per_s=0.5)
-    environment = SuperBallEnvironment(task=task)
-    start, _ = environment.reset(seed=0)
-    with monkeypatch.context() as patch:
-        patch.setattr(simulation, "FASTEST_SOUND_M_PER_S", 0.0)
-        observation, reward, terminated, truncated, info = environment.step(np.zeros(24, np.float32))
+def test_leaving_the_sound_states_terminates_says_why_and_never_pays() -> None:
+    """A robot of coarse physics steps whose bars spin freely stands, but does not bear fast winches."""
+    fragile = RobotSettings(
+        physics_step_s=0.01,
+        axial_inertia_kg_m2=0.01,
+        axial_damping_n_m_s=0.0,
+        cable_max_tension_n=10000.0,
+        winch_speed_m_per_s=2.0,
+        shortest_command_m=0.4,
+    )
+    environment = SuperBallEnvironment(fragile, TaskSettings(target_speed_m_per_s=0.5))
+    observation, _ = environment.reset(seed=0)
+    jerks = np.sign(actions(100))
+    for action in jerks:
+        before = observation
+        observation, reward, terminated, truncated, info = environment.step(action)
+        if terminated:
+            break
     assert (terminated, truncated) == (True, False)
     assert "unstable" in info["ended_by"]
-    assert np.array_equal(observation, start)
+    assert np.array_equal(observation, before)
     assert reward == -EPISODE_STEPS * 0.5**2
     with pytest.raises(gymnasium.error.ResetNeeded, match="reset"):
         environment.step(np.zeros(24, np.float32))

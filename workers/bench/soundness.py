@@ -9,11 +9,12 @@ import numpy as np
 from t6gps.storage.errors import UnsoundStateError
 from t6gps.workers.episode.start import random_start
 from t6gps.workers.ground.terrain import generate
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.robot.topology import CABLES, CABLES_N
 from t6gps.workers.settings import RobotSettings
 
 EPISODE_STEPS = 250
+"""Control steps T of an episode (paper Sec. IV-A)."""
 
 _WIDEST = RobotSettings(shortest_command_m=0.4, longest_command_m=1.6, winch_speed_m_per_s=2.0)
 EXTREME_ROBOTS = tuple(
@@ -38,15 +39,15 @@ def extremes(robot: RobotSettings, seeds: Iterable[int]) -> dict[str, float]:
     """
     unsound, lowest_m = 0, np.inf
     largest = np.zeros(3)
-    with Simulation(robot) as simulation:
+    with PyBulletEngine(robot) as engine:
         for seed in seeds:
             rng, ground = np.random.default_rng(seed), generate(seed, 1.0)
-            simulation.set_ground(ground)
+            engine.set_ground(ground)
             try:
-                random_start(simulation, robot, ground, rng)
+                random_start(engine, robot, ground, rng)
                 for _ in range(EPISODE_STEPS):
                     command = rng.uniform(robot.shortest_command_m, robot.longest_command_m, CABLES_N)
-                    state = simulation.control_step(command)
+                    state = engine.control_step(command)
                     nodes = state.nodes()
                     lowest_m = min(lowest_m, (nodes[:, 2] - ground.height(nodes[:, 0], nodes[:, 1])).min())
                     reached = (
@@ -70,7 +71,7 @@ def soundness(episodes: int = 500) -> dict[str, float]:
     """`extremes` over EXTREME_ROBOTS, `episodes` in all: what `t6gps bench soundness` reports."""
     seeds = range(episodes // len(EXTREME_ROBOTS))
     each = [extremes(robot, seeds) for robot in EXTREME_ROBOTS]
-    result = {key: max(found[key] for found in each) for key in each[0]}
-    result["unsound_episodes"] = sum(found["unsound_episodes"] for found in each)
-    result["lowest_node_m"] = min(found["lowest_node_m"] for found in each)
+    result = {key: max(figures[key] for figures in each) for key in each[0]}
+    result["unsound_episodes"] = sum(figures["unsound_episodes"] for figures in each)
+    result["lowest_node_m"] = min(figures["lowest_node_m"] for figures in each)
     return {"episodes": len(seeds) * len(each), **result}

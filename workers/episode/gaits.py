@@ -13,12 +13,25 @@ from t6gps.workers.robot.topology import CABLES, CABLES_N
 Array = NDArray[np.float64]
 
 FLOP_PERIOD_STEPS = 16
-LEAN, LEAN_WITH_HEIGHT = 0.8, 0.8
-"""Change of a rest length per metre of its cable ahead of the centre of mass, and the same per metre of its height."""
+"""0.8 s to lean and 0.8 s to let go."""
+
+LEAN = 0.8
+"""Change of a rest length per metre of its cable ahead of the centre of mass."""
+
+LEAN_WITH_HEIGHT = 0.8
+"""The same per metre of its height."""
 
 WAVE_PARAMETERS_N = 2 * CABLES_N + 1
-SLOWEST_HZ, FASTEST_HZ = 0.2, 1.5
+"""Two amplitudes of each cable, and the frequency."""
+
+SLOWEST_HZ = 0.2
+"""Five seconds: the time that a waypoint has."""
+
+FASTEST_HZ = 1.5
+"""Winches do not follow faster waves: at 0.35 m/s they move 0.23 m in a period of this one."""
+
 WAVE_SCALE_M = 0.3
+"""Amplitude that a parameter of 1 stands for."""
 
 
 def flop(nominal_m: float) -> Controller:

@@ -2,8 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
-from typing import Any
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
@@ -12,17 +13,25 @@ from numpy.typing import NDArray
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.storage.schema import EPISODES, FRAMES, vector_length
 from t6gps.workers.episode.task import running_cost
-from t6gps.workers.physics.simulation import CONTROL_STEP_S
+from t6gps.workers.physics.engine import CONTROL_STEP_S
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, exit_edge
 from t6gps.workers.robot.symmetry import CABLES_FROM, NODES_FROM, world_map
 from t6gps.workers.robot.topology import FACE_KINDS
-from t6gps.workers.settings import RolloutSettings
+from t6gps.workers.settings import RolloutSettings, TaskSettings
 
 Array = NDArray[np.float64]
+Column = NDArray[np.generic] | Sequence[int | None]
+Scalar = TypeVar("Scalar", bound=np.generic)
+
 STUCK_SPEED_M_PER_S = 0.05
-STUCK_DISTANCE_M, STUCK_STEPS = 0.05, round(1.0 / CONTROL_STEP_S)
+"""Stuck by speed: slower than this."""
+
+STUCK_DISTANCE_M = 0.05
 """Stuck by distance: less than this far from where the centre of mass was one second before."""
+
+STUCK_STEPS = round(1.0 / CONTROL_STEP_S)
+"""That second in control steps."""
 
 
 @dataclass
@@ -34,19 +43,11 @@ class Record:
     yaws_rad: list[float] = field(default_factory=list)
     waypoints: list[tuple[int, float, float]] = field(default_factory=list)
     observations: list[NDArray[np.float32]] = field(default_factory=list)
-    actions: list[NDArray[np.floating]] = field(default_factory=list)
-    means: list[NDArray[np.floating]] = field(default_factory=list)
+    actions: list[Array] = field(default_factory=list)
+    means: list[Array] = field(default_factory=list)
 
 
-def canonical_vectors(vectors: Array, maps: Array, labels: NDArray[np.int64]) -> Array:
-    """Relabel and map world vectors [T, n, 3] into the frames of their rows.
-
-    `maps` [T, 3, 3] are the `world_map`s of the rows, `labels` [T, n] the rows of a FROM map.
-    """
-    return vectors[np.arange(len(vectors))[:, None], labels] @ maps.swapaxes(1, 2)
-
-
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Outcome:
     """What the loop knows of an episode beside its plan and its record."""
 
@@ -56,93 +57,156 @@ class Outcome:
     delay_steps: int
 
 
+@dataclass(frozen=True, kw_only=True)
+class _Motion:
+    """The rows of a record as arrays, and what both tables derive from them.
+
+    state, com, velocity      bars and rest lengths; centre of mass [T + 1, 3] (m) and its velocity (m/s)
+    number, waypoint          number of the active waypoint [T + 1] and its place [T + 1, 2] (m)
+    distance, direction       to the waypoint: distance [T + 1] (m), horizontal unit vector [T + 1, 2]
+    speed, forward_speed      of the centre of mass, in all and towards the waypoint [T + 1] (m/s)
+    cost                      running cost [T + 1] (m2/s2)
+    """
+
+    state: RobotState
+    com: Array
+    velocity: Array
+    number: NDArray[np.int64]
+    waypoint: Array
+    distance: Array
+    direction: Array
+    speed: Array
+    forward_speed: Array
+    cost: Array
+
+
 def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings) -> Episode:
     """The two tables of an episode; whoever hands them on checks them."""
+    motion = _motion(record, settings.task)
+    shared = {
+        "episode_id": plan.episode_id,
+        "iteration": plan.iteration,
+        "policy_version": outcome.policy_version,
+    }
     rows = len(record.states)
+    columns: dict[str, Column] = {name: np.full(rows, value) for name, value in shared.items()}
+    columns |= _world_columns(motion) | _canonical_columns(record, motion)
+    summary: dict[str, object] = shared | _summary(record, motion, plan, outcome, settings)
+    return Episode(
+        pa.table([_arrow(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
+        pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
+    )
+
+
+def _motion(record: Record, task: TaskSettings) -> _Motion:
     states = record.states
     state = RobotState(_stacked([s.bars for s in states]), _stacked([s.rest_lengths for s in states]))
-    element = np.array([frame.element for frame in record.frames])
-    yaw = np.array(record.yaws_rad)
     number, waypoint_x, waypoint_y = (np.array(column) for column in zip(*record.waypoints, strict=True))
     com, velocity = state.com, state.com_velocity
-    to_waypoint = np.stack([waypoint_x, waypoint_y], axis=1) - com[:, :2]
+    waypoint = np.stack([waypoint_x, waypoint_y], axis=1)
+    to_waypoint = waypoint - com[:, :2]
     distance = np.hypot(*to_waypoint.T)
     direction = to_waypoint / distance[:, None]
-    maps = world_map(element, yaw)
-    forward_speed = (velocity[:, :2] * direction).sum(axis=1)
-    speed = np.linalg.norm(velocity, axis=1)
-    cost = running_cost(velocity, direction, settings.task)
-    frames = record.frames
-    face = np.array([frame.face for frame in frames])
-    transitions = np.flatnonzero(np.diff(face))
-    exits: list[int | None] = [None] * rows
-    for row in transitions:
-        exits[row] = exit_edge(frames[row], frames[row + 1].face)
-    columns: dict[str, Any] = {
-        "episode_id": np.full(rows, plan.episode_id),
-        "iteration": np.full(rows, plan.iteration),
+    return _Motion(
+        state=state,
+        com=com,
+        velocity=velocity,
+        number=number,
+        waypoint=waypoint,
+        distance=distance,
+        direction=direction,
+        speed=np.linalg.norm(velocity, axis=1),
+        forward_speed=(velocity[:, :2] * direction).sum(axis=1),
+        cost=running_cost(velocity, direction, task),
+    )
+
+
+def _world_columns(motion: _Motion) -> dict[str, Column]:
+    """Columns that hold world coordinates or none."""
+    rows = len(motion.com)
+    return {
         "step": np.arange(rows),
         "time_s": np.arange(rows) * CONTROL_STEP_S,
-        "policy_version": np.full(rows, outcome.policy_version),
-        "com_x_m": com[:, 0],
-        "com_y_m": com[:, 1],
-        "com_z_m": com[:, 2],
-        "speed_m_per_s": speed,
-        "forward_speed_m_per_s": forward_speed,
-        "cost": cost,
-        "waypoint": number,
-        "waypoint_x_m": waypoint_x,
-        "waypoint_y_m": waypoint_y,
-        "waypoint_distance_m": distance,
+        "com_x_m": motion.com[:, 0],
+        "com_y_m": motion.com[:, 1],
+        "com_z_m": motion.com[:, 2],
+        "speed_m_per_s": motion.speed,
+        "forward_speed_m_per_s": motion.forward_speed,
+        "cost": motion.cost,
+        "waypoint": motion.number,
+        "waypoint_x_m": motion.waypoint[:, 0],
+        "waypoint_y_m": motion.waypoint[:, 1],
+        "waypoint_distance_m": motion.distance,
+        "bar_positions": motion.state.bar_positions,
+        "bar_orientations": motion.state.bar_orientations,
+        "bar_velocities": motion.state.bar_velocities,
+        "bar_angular_velocities": motion.state.bar_angular_velocities,
+    }
+
+
+def _canonical_columns(record: Record, motion: _Motion) -> dict[str, Column]:
+    """Support triangle and frame of each row, and what is seen and commanded in that frame."""
+    frames, state = record.frames, motion.state
+    face = np.array([frame.face for frame in frames])
+    element = np.array([frame.element for frame in frames])
+    yaw = np.array(record.yaws_rad)
+    maps, nodes_from = world_map(element, yaw), NODES_FROM[element]
+    exits: list[int | None] = [None] * len(frames)
+    for row in np.flatnonzero(np.diff(face)):
+        exits[row] = exit_edge(frames[row], frames[row + 1].face)
+    return {
         "face": face,
         "kind": FACE_KINDS[face],
         "entry_edge": [frame.entry_edge for frame in frames],
         "exit_edge": exits,
         "element": element,
         "frame_yaw_rad": yaw,
-        "nodes": canonical_vectors(state.nodes() - com[:, None], maps, NODES_FROM[element]),
-        "node_velocities": canonical_vectors(state.node_velocities() - velocity[:, None], maps, NODES_FROM[element]),
-        "com_velocity": np.einsum("tij,tj->ti", maps, velocity),
-        "target_direction": np.einsum("tij,tj->ti", maps[:, :2, :2], direction),
+        "nodes": canonical_vectors(state.nodes() - motion.com[:, None], maps, nodes_from),
+        "node_velocities": canonical_vectors(state.node_velocities() - motion.velocity[:, None], maps, nodes_from),
+        "com_velocity": np.einsum("tij,tj->ti", maps, motion.velocity),
+        "target_direction": np.einsum("tij,tj->ti", maps[:, :2, :2], motion.direction),
         "rest_lengths": np.take_along_axis(state.rest_lengths, CABLES_FROM[element], axis=1),
         "observation": _stacked(record.observations),
         "action": _stacked(record.actions),
         "action_mean": _stacked(record.means),
-        "bar_positions": state.bar_positions,
-        "bar_orientations": state.bar_orientations,
-        "bar_velocities": state.bar_velocities,
-        "bar_angular_velocities": state.bar_angular_velocities,
     }
+
+
+def _summary(
+    record: Record, motion: _Motion, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings
+) -> dict[str, object]:
+    """The row of the episode; means are over the rows that an action led to."""
     moved = slice(1, None)
-    path = np.hypot(*np.diff(com[:, :2], axis=0).T).sum()
-    summary: dict[str, object] = {
-        "episode_id": plan.episode_id,
-        "iteration": plan.iteration,
+    faces = [frame.face for frame in record.frames]
+    return {
         "index": plan.index,
         "seed": plan.seed,
         "terrain_seed": plan.terrain_seed,
         "terrain_difficulty": plan.terrain_difficulty,
-        "policy_version": outcome.policy_version,
         "noise_std_m": plan.noise_std_m,
-        "steps": rows - 1,
+        "steps": len(record.states) - 1,
         "ended_by": outcome.ended_by,
-        "cost": float(cost[moved].mean()),
-        "forward_speed_m_per_s": float(forward_speed[moved].mean()),
-        "stuck_share": float((speed[moved] < STUCK_SPEED_M_PER_S).mean()),
-        "stuck_share_by_distance": stuck_share_by_distance(com),
+        "cost": float(motion.cost[moved].mean()),
+        "forward_speed_m_per_s": float(motion.forward_speed[moved].mean()),
+        "stuck_share": float((motion.speed[moved] < STUCK_SPEED_M_PER_S).mean()),
+        "stuck_share_by_distance": stuck_share_by_distance(motion.com),
         "waypoints_reached": outcome.waypoints_reached,
-        "path_length_m": float(path),
-        "transitions": len(transitions),
+        "path_length_m": float(np.hypot(*np.diff(motion.com[:, :2], axis=0).T).sum()),
+        "transitions": int(np.count_nonzero(np.diff(faces))),
         "bar_mass_kg": settings.robot.bar_mass_kg,
         "cable_stiffness_n_per_m": settings.robot.cable_stiffness_n_per_m,
         "friction": settings.robot.friction,
         "winch_speed_m_per_s": settings.robot.winch_speed_m_per_s,
         "delay_steps": outcome.delay_steps,
     }
-    return Episode(
-        pa.table([_column(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
-        pa.table([pa.array([summary[f.name]], f.type) for f in EPISODES], schema=EPISODES),
-    )
+
+
+def canonical_vectors(vectors: Array, maps: Array, labels: NDArray[np.int64]) -> Array:
+    """Relabel and map world vectors [T, n, 3] into the frames of their rows.
+
+    `maps` [T, 3, 3] are the `world_map`s of the rows, `labels` [T, n] the rows of a FROM map.
+    """
+    return vectors[np.arange(len(vectors))[:, None], labels] @ maps.swapaxes(1, 2)
 
 
 def stuck_share_by_distance(com: Array) -> float | None:
@@ -156,12 +220,12 @@ def stuck_share_by_distance(com: Array) -> float | None:
     return float((distance < STUCK_DISTANCE_M).mean())
 
 
-def _stacked(rows: list[NDArray[Any]]) -> NDArray[Any]:
+def _stacked(rows: Sequence[NDArray[Scalar]]) -> NDArray[Scalar]:
     """What numpy.stack gives, several times faster for many small arrays."""
     return np.concatenate(rows).reshape(len(rows), *rows[0].shape)
 
 
-def _column(values: Any, target: pa.Field, rows: int) -> pa.Array:
+def _arrow(values: Column, target: pa.Field, rows: int) -> pa.Array:
     """Column of `rows` entries; where a vector column has fewer values, the last entries are null."""
     length = vector_length(target)
     if length is None:

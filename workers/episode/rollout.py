@@ -12,13 +12,13 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.episode import exploration, policy
 from t6gps.workers.episode.recording import Outcome, Record, to_episode
 from t6gps.workers.episode.running import RunningEpisode
+from t6gps.workers.physics.engine import Engine
 from t6gps.workers.physics.observer import steer
-from t6gps.workers.physics.simulation import Simulation
 from t6gps.workers.settings import RolloutSettings
 
 
 def rollout(
-    simulation: Simulation,
+    engine: Engine,
     settings: RolloutSettings,
     plan: EpisodePlan,
     snapshot: PolicySnapshot,
@@ -27,7 +27,7 @@ def rollout(
 ) -> Episode:
     """Run the episode that `plan` describes with the policy `snapshot` plus exploration noise.
 
-    The result depends on the arguments alone, whatever the simulation did before. An episode that leaves the ground
+    The result depends on the arguments alone, whatever the engine did before. An episode that leaves the ground
     or the range of sound states ends there and says why in `ended_by`; PhysicsError if it does so at once. An empty
     `record` of the caller's is filled as the episode goes: it shows how far one came that failed.
     """
@@ -37,7 +37,7 @@ def rollout(
     def control(episode: RunningEpisode, _: int) -> NDArray[np.float64]:
         return act(episode.observation)
 
-    return controlled(simulation, settings, plan, control, snapshot.version, snapshot.offset_m, delay_steps, record)
+    return controlled(engine, settings, plan, control, snapshot.version, snapshot.offset_m, delay_steps, record)
 
 
 Controller = Callable[[RunningEpisode, int], NDArray[np.float64]]
@@ -45,7 +45,7 @@ Controller = Callable[[RunningEpisode, int], NDArray[np.float64]]
 
 
 def controlled(
-    simulation: Simulation,
+    engine: Engine,
     settings: RolloutSettings,
     plan: EpisodePlan,
     control: Controller,
@@ -59,14 +59,7 @@ def controlled(
     `version` goes into the tables as the policy's, observed rest lengths are centred on `nominal_m`.
     """
     episode = RunningEpisode(
-        simulation,
-        settings,
-        plan.seed,
-        plan.terrain_seed,
-        plan.terrain_difficulty,
-        nominal_m,
-        delay_steps,
-        plan.index,
+        engine, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, nominal_m, delay_steps, plan.index
     )
     noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation, plan.steps)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
@@ -88,7 +81,12 @@ def controlled(
         record.means.append(mean)
         record.actions.append(action)
         _keep(record, episode)
-    outcome = Outcome(version, ended_by, episode.course.reached, delay_steps)
+    outcome = Outcome(
+        policy_version=version,
+        ended_by=ended_by,
+        waypoints_reached=episode.course.reached,
+        delay_steps=delay_steps,
+    )
     return to_episode(record, plan, outcome, settings)
 
 

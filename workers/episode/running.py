@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 from t6gps.workers.episode.start import random_start, rest_start
 from t6gps.workers.episode.task import Course, one_direction, random_waypoints
 from t6gps.workers.ground.ground import ground
+from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
 from t6gps.workers.physics.observer import observe, survey
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation
 from t6gps.workers.robot.support import SupportFrame, enter
 from t6gps.workers.settings import RolloutSettings
 
@@ -21,7 +21,7 @@ SENSOR_STREAM = 4
 
 
 class RunningEpisode:
-    """The robot on its way; it depends on the arguments and the commands alone, whatever the simulation did before.
+    """The robot on its way; it depends on the arguments and the commands alone, whatever the engine did before.
 
     state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
     waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
@@ -37,7 +37,7 @@ class RunningEpisode:
 
     def __init__(
         self,
-        simulation: Simulation,
+        engine: Engine,
         settings: RolloutSettings,
         seed: int,
         terrain_seed: int,
@@ -49,18 +49,18 @@ class RunningEpisode:
         robot, task = settings.robot, settings.task
         start_rng, course_rng, self.noise_rng = np.random.default_rng(seed).spawn(3)
         terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
-        simulation.set_ground(terrain)
-        self._simulation = simulation
+        engine.set_ground(terrain)
+        self._engine = engine
         self._sensor_noise = settings.randomisation.sensor_noise
         if self._sensor_noise:
             self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
         self._nominal_m = nominal_m
         self._step = 0
-        if task.directions:
-            self.state = rest_start(simulation, robot)
+        if task.directions is not None:
+            self.state = rest_start(engine, robot)
             waypoints = one_direction(number, self.state.com[:2], task.directions)
         else:
-            self.state = random_start(simulation, robot, terrain, start_rng)
+            self.state = random_start(engine, robot, terrain, start_rng)
             waypoints = random_waypoints(course_rng, self.state.com[:2], task)
         self.course = Course(waypoints, task)
         self._delayed = deque([self.state.rest_lengths] * delay_steps)
@@ -69,10 +69,10 @@ class RunningEpisode:
     def advance(self, command: NDArray[np.float64]) -> None:
         """Take one control step under commanded rest lengths [24] (m) in world labels.
 
-        UnsoundStateError if it leaves the range of sound states; then everything but the simulation stays as it was.
+        UnsoundStateError if it leaves the range of sound states; then everything but the engine stays as it was.
         """
         self._delayed.append(command)
-        self.state = self._simulation.control_step(self._delayed.popleft())
+        self.state = self._engine.control_step(self._delayed.popleft())
         self._step += 1
         self._look(self.frame)
 

@@ -15,7 +15,7 @@ FENCE_HEIGHT_M = 2.0
 
 def ground(settings: TerrainSettings, seed: int, difficulty: float) -> Terrain | None:
     """Ground of an episode, None for the endless plane. Raises TerrainError as `generate` and `surface.load`."""
-    if settings.file:
+    if settings.file is not None:
         from t6gps.workers.ground.surface import load  # trimesh takes most of a second to load
 
         terrain = load(Path(settings.file), settings.size_m, settings.png_range_m)

@@ -19,7 +19,12 @@ from t6gps.storage.errors import TerrainError
 from t6gps.workers.ground.terrain import CELL_M, Terrain
 from t6gps.workers.robot.state import Array
 
-FINEST_CELL_M, COARSEST_CELL_M = 0.1, 2.0
+FINEST_CELL_M = 0.1
+"""As wide as a bar."""
+
+COARSEST_CELL_M = 2.0
+"""As long as a bar."""
+
 STEEPEST_MEAN_SLOPE_DEG = 60.0
 """Ground that is steeper on average cannot be stood on."""
 

@@ -13,13 +13,17 @@ import numpy as np
 
 from t6gps.storage.errors import TerrainError
 from t6gps.workers.robot.state import Array
+from t6gps.workers.settings import STEEPEST_DIFFICULTY
 
 CELL_M = 0.5
+"""A quarter of a bar: facets are smaller than the support triangle and larger than a foot."""
+
 BLUR_STD_M = 0.41
+"""Chosen with the two below for the paper's slopes: 38 deg on average, standard deviation 16 deg."""
+
 HEIGHT_STD_M = 0.50
 LARGEST_HEIGHT_M = 0.775
-STEEPEST_DIFFICULTY = 1.5
-"""Slopes of 48 deg on average, heights over a range of 2.3 m."""
+"""Half the paper's range of heights."""
 
 
 @dataclass(frozen=True)

@@ -1,12 +1,12 @@
 """The robot as a MuJoCo model (MJCF), for engines and viewers that read that format. Needs no MuJoCo itself.
 
-The bars are six free capsules with the inertia of physics/simulation.py. A cable is a tendon between two sites with
+The bars are six free capsules with the inertia of physics/bullet_world.py. A cable is a tendon between two sites with
 an actuator that pulls as a spring and a damper do:
 
     force      clip(k (u + r0 - l) - c l', -T_max, 0)
     u, r0, l   control (m), nominal rest length, length of the tendon
 
-so that a control of 0 is the nominal rest length. That is the law of workers/physics/reference.py but for the limits of
+so that a control of 0 is the nominal rest length. That is the law of workers/physics/cables.py but for the limits of
 the damping, which matter to cables that are nearly slack. Six more actuators, whose controls stay 0, brake the
 spin of the bars about their axes.
 """
@@ -19,16 +19,20 @@ from xml.etree import ElementTree
 import numpy as np
 
 from t6gps.workers.ground.terrain import Terrain
-from t6gps.workers.physics.simulation import GRAVITY_M_PER_S2, neutral_state, nominal_rest_length
+from t6gps.workers.physics.engine import GRAVITY_M_PER_S2
+from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS, BARS_N, CABLES
 from t6gps.workers.settings import RobotSettings
 
 START_CLEARANCE_M = 0.1
 """Height of the lowest node's centre line above the highest ground below the initial state (m)."""
+
 GROUND_DEPTH_M = 2.0
 """Thickness of rough ground below its lowest point (m)."""
 
-_BAR_COLOR, _CABLE_COLOR, _GROUND_COLOR = "0.25 0.25 0.3 1", "0.75 0.2 0.15 1", "0.8 0.78 0.72 1"
+_BAR_COLOR = "0.25 0.25 0.3 1"
+_CABLE_COLOR = "0.75 0.2 0.15 1"
+_GROUND_COLOR = "0.8 0.78 0.72 1"
 
 
 def to_mjcf(robot: RobotSettings, terrain: Terrain | None = None) -> str:

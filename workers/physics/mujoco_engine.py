@@ -1,7 +1,7 @@
 """The robot in MuJoCo instead of PyBullet: a second opinion from an engine that shares no code with the first.
 
 MuJoCo moves the bars of workers/physics/mjcf.py and solves their contacts. The loads on the bars are those of
-workers/physics/reference.py, in place of the model's own cables, whose damping has fewer limits.
+workers/physics/cables.py, in place of the model's own cables, whose damping has fewer limits.
 """
 
 from __future__ import annotations
@@ -10,9 +10,11 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.ground.terrain import Terrain
+from t6gps.workers.physics.cables import loads, move_winches
+from t6gps.workers.physics.engine import Engine
+from t6gps.workers.physics.limits import check_sound, clipped, physics_steps_n
 from t6gps.workers.physics.mjcf import to_mjcf
-from t6gps.workers.physics.reference import loads, move_winches
-from t6gps.workers.physics.simulation import CONTROL_STEP_S, Simulation, neutral_state
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.topology import BARS_N
 from t6gps.workers.settings import RobotSettings
@@ -22,7 +24,7 @@ try:
 except ImportError:
     raise PhysicsError("the engine mujoco needs the package mujoco; install it: pip install 't6gps[mujoco]'") from None
 
-__all__ = ["MujocoSimulation", "MujocoStepper", "mujoco"]
+__all__ = ["MujocoEngine", "MujocoStepper", "mujoco"]
 
 
 class MujocoStepper:
@@ -30,12 +32,7 @@ class MujocoStepper:
 
     def __init__(self, robot: RobotSettings, terrain: Terrain | None) -> None:
         self._robot = robot
-        self._steps_n = round(CONTROL_STEP_S / robot.physics_step_s)
-        if abs(self._steps_n * robot.physics_step_s - CONTROL_STEP_S) > 1e-9:
-            raise PhysicsError(
-                f"robot.physics_step_s must divide the control step of {CONTROL_STEP_S} s, "
-                f"got {robot.physics_step_s}; choose for instance 0.001, 0.002, 0.004 or 0.005"
-            )
+        self._steps_n = physics_steps_n(robot)
         self.model = mujoco.MjModel.from_xml_string(to_mjcf(robot, terrain))
         # By itself MuJoCo would put an unstable robot back to its start, unnoticed.
         self.model.opt.disableflags |= mujoco.mjtDisableBit.mjDSBL_AUTORESET
@@ -58,36 +55,46 @@ class MujocoStepper:
         angular_velocities = _turned(velocities[:, 3:], orientations)  # MuJoCo has them in the axes of the bars
         return RobotState.of(poses[:, :3], orientations, velocities[:, :3], angular_velocities, rest_lengths)
 
-    def control_step(self, _: list[int], rest_lengths: Array, command: Array) -> RobotState:
+    def control_step(self, rest_lengths: Array, command: Array) -> RobotState:
         """State after one control step under `command` [24] (m)."""
-        for _step in range(self._steps_n):
+        for _ in range(self._steps_n):
             rest_lengths = move_winches(rest_lengths, command, self._robot)
             self.data.xfrc_applied[1:] = np.hstack(loads(self.state(rest_lengths), self._robot))
             mujoco.mj_step(self.model, self.data)
         return self.state(rest_lengths)
 
 
-class MujocoSimulation(Simulation):
-    """workers.physics.Simulation with MuJoCo in place of PyBullet; `client` and `bodies` mean nothing here."""
+class MujocoEngine(Engine):
+    """One MuJoCo model of the robot and its ground. Raises PhysicsError if the physics cannot be started."""
 
     def __init__(self, robot: RobotSettings) -> None:
         self.robot = robot
-        self.client, self.bodies = -1, []
         self.set_ground(None)
 
-    def close(self) -> None:
-        """Does nothing: MuJoCo's memory goes with the object."""
-
     def set_ground(self, terrain: Terrain | None) -> None:
-        """Replaces the ground, None being the plane z = 0, and puts the robot into its neutral state."""
+        """Replace the ground, None being the plane z = 0, and put the robot into its neutral state."""
         self._terrain = terrain
-        self._stepper = self._mujoco = MujocoStepper(self.robot, terrain)
+        self._stepper = MujocoStepper(self.robot, terrain)
         self.reset(neutral_state(self.robot))
 
     def reset(self, state: RobotState) -> None:
-        """Puts bars and rest lengths where `state` says."""
-        self._mujoco.place(state)
-        self._state = self._mujoco.state(np.array(state.rest_lengths, dtype=float))
+        """Put bars and rest lengths where `state` says, and forget all contacts of the past."""
+        self._stepper.place(state)
+        self._state = self._stepper.state(np.array(state.rest_lengths, dtype=float))
+
+    def state(self) -> RobotState:
+        """The present state."""
+        return self._state
+
+    def control_step(self, command: Array) -> RobotState:
+        """The state 0.1 s later, as `Engine.control_step` describes it."""
+        within = clipped(command, self.robot)
+        self._state = self._stepper.control_step(self._state.rest_lengths, within)
+        check_sound(self._state, self._terrain)
+        return self._state
+
+    def close(self) -> None:
+        """Do nothing: MuJoCo's memory goes with the object."""
 
 
 def _turned(vectors: Array, q: Array) -> Array:

@@ -12,9 +12,26 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 
 FINE_M = 0.1
+"""Cell of the grid on which shadows of the hills are computed."""
+
 SHADOW_REACH_M = 4.0
-CONTOUR_STEP_M, GRID_STEP_M, LINE_HALF_WIDTH_M = 0.25, 1.0, 0.006
-LOWEST_M, HIGHEST_M = -0.8, 0.8
+"""How far towards the sun hills are looked for."""
+
+CONTOUR_STEP_M = 0.25
+"""Height between two contour lines."""
+
+GRID_STEP_M = 1.0
+"""Between two lines of the grid on flat ground."""
+
+LINE_HALF_WIDTH_M = 0.006
+"""Of both kinds of lines."""
+
+LOWEST_M = -0.8
+"""Height of the first of TINTS: the lowest ground of difficulty 1."""
+
+HIGHEST_M = 0.8
+"""Height of the last of TINTS."""
+
 TINTS = np.array([[0.05, 0.11, 0.13], [0.14, 0.19, 0.14], [0.40, 0.31, 0.19], [0.72, 0.62, 0.47]])
 """Albedo from the lowest to the highest ground."""
 FLAT_TINT = np.array([0.33, 0.33, 0.29], np.float32)

@@ -20,9 +20,14 @@ Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 
-NEAREST_M, FARTHEST_M = 0.5, 80.0
-"""Depths between which things are seen."""
+NEAREST_M = 0.5
+"""Depth from which on things are seen."""
+
+FARTHEST_M = 80.0
+"""Depth up to which things are seen: twice the width of the usual ground."""
+
 SHADOW_TEXEL_M = 0.01
+"""Side of a cell of the shadow map."""
 
 ShadowMap = tuple[Array, Floats, Floats]
 """Plane, first corner and shares of sunlight, as `cast_shadow` describes them."""

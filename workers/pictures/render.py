@@ -44,13 +44,32 @@ Ints = NDArray[np.int64]
 Picture = NDArray[np.uint8]
 Progress = Callable[[int, int], None]
 
-STILL_SIZE, PANEL_SIZE, FILM_SIZE = (1280, 720), (640, 420), (960, 540)
-"""Width and height in pixels."""
-STILL_SAMPLES, FILM_SAMPLES = 3, 2
-"""Rays per pixel along each axis."""
+STILL_SIZE = (1280, 720)
+"""Width and height of a still in pixels."""
+
+PANEL_SIZE = (640, 420)
+"""Of one panel of a strip."""
+
+FILM_SIZE = (960, 540)
+"""Of a film."""
+
+STILL_SAMPLES = 3
+"""Rays per pixel of a still along each axis."""
+
+FILM_SAMPLES = 2
+"""Of a film, which has hundreds of pictures."""
+
 FRAMES_PER_S = 10
+"""One picture per control step: films run at the robot's own speed."""
+
 BAND_ROWS = 24
-STRIP_COLUMNS, STRIP_GAP = 3, 6
+"""Rows of rays that are drawn at once."""
+
+STRIP_COLUMNS = 3
+"""Panels side by side."""
+
+STRIP_GAP = 6
+"""Between panels (pixels)."""
 
 ROD_COLOURS = np.array(
     [[0.78, 0.80, 0.82], [0.85, 0.17, 0.02], [0.04, 0.05, 0.07], [0.90, 0.88, 0.85], [1.00, 0.62, 0.05]], np.float32
@@ -58,11 +77,24 @@ ROD_COLOURS = np.array(
 TRIANGLE_COLOURS = np.array([[0.02, 0.30, 0.85], [0.75, 0.08, 0.45]], np.float32)
 """Of a Delta and of a Lambda."""
 WAYPOINT_COLOUR = np.array([1.00, 0.62, 0.05], np.float32)
-SUN, SKY = np.array([1.38, 1.24, 1.00], np.float32), np.array([0.27, 0.34, 0.46], np.float32)
+
+SUN = np.array([1.38, 1.24, 1.00], np.float32)
+"""Light of the sun: warm."""
+
+SKY = np.array([0.27, 0.34, 0.46], np.float32)
+"""Light of the sky, also in the shade: cold."""
+
 HORIZON = np.array([0.60, 0.70, 0.80], np.float32)
+"""Into which the ground fades."""
+
 HAZE_M = 30.0
+"""Distance at which a third of the ground's own light is left."""
+
 SHADOW_REACH_M = 5.5
+"""Largest distance from the robot of a shadow that it throws."""
+
 BEYOND_M = np.float32(1000.0)
+"""Depth of a ray that meets nothing."""
 
 
 def still(frames: pa.Table, terrain: Terrain | None, step: int, size: tuple[int, int] = STILL_SIZE) -> Picture:

@@ -20,20 +20,53 @@ from t6gps.workers.settings import RobotSettings
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
 
-DISTANCE_M, ELEVATION_RAD, FIELD_OF_VIEW = 9.4, np.radians(29), 0.84
-"""Of the camera: from the robot, above the horizon; width of the picture at depth 1 m (m)."""
+DISTANCE_M = 9.4
+"""Of the camera from the robot."""
+
+ELEVATION_RAD = np.radians(29)
+"""Of the camera above the horizon."""
+
+FIELD_OF_VIEW = 0.84
+"""Width of the picture at depth 1 m (m)."""
+
 AIM = 0.01
 """How far above the robot the camera aims, in m per m of depth."""
+
 SMOOTHING_S = 1.5
+"""The camera follows the robot's path under a Gaussian of this standard deviation, so that it does not rock."""
+
 WAYPOINT_TURN_RAD = np.radians(35)
 """The camera likes to see the way to the waypoint go to the right and away."""
-SUN_ELEVATION_RAD, SUN_TURN_RAD = np.radians(40), np.radians(112)
+
+SUN_ELEVATION_RAD = np.radians(40)
+"""Above most slopes of rough ground, which are 38 deg on average."""
+
+SUN_TURN_RAD = np.radians(112)
 """The sun stands on the left, a little behind the camera."""
+
 FLAG_HEIGHT_M = 1.0
+"""Of the pole that marks the waypoint."""
 
 BAR, CAP, CABLE, POLE, TRACK = range(5)
+"""Parts, in the order of render.ROD_COLOURS."""
+
 BAR_RADIUS_M = RobotSettings().bar_radius_m
-CAP_LENGTH_M, CABLE_RADIUS_M, POLE_RADIUS_M, BALL_RADIUS_M, TRACK_RADIUS_M = 0.07, 0.009, 0.018, 0.10, 0.02
+"""The usual one: recorded rows do not tell the robot's own."""
+
+CAP_LENGTH_M = 0.07
+"""Of the coloured ends of a bar."""
+
+CABLE_RADIUS_M = 0.009
+"""Of a drawn cable."""
+
+POLE_RADIUS_M = 0.018
+"""Of the waypoint's pole."""
+
+BALL_RADIUS_M = 0.10
+"""Of the ball on that pole."""
+
+TRACK_RADIUS_M = 0.02
+"""Of the track of the centre of mass."""
 
 
 @dataclass(frozen=True)
@@ -49,7 +82,7 @@ class Rods:
         return Rods(self.a[chosen], self.b[chosen], self.r[chosen], self.part[chosen])
 
 
-@dataclass(frozen=True)
+@dataclass(frozen=True, kw_only=True)
 class Scene:
     """An episode on its ground, seen in the fixed horizontal direction `forward` [2] from `eyes` [T + 1, 3] (m).
 

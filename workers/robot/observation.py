@@ -24,9 +24,19 @@ from t6gps.workers.robot.support import SupportFrame
 from t6gps.workers.robot.symmetry import BARS_FROM, CABLES_FROM, NODES_FROM, PROPER, world_map
 
 REST_LENGTH_SCALE_M = 0.2
+"""The unit of rest lengths."""
+
 ANGULAR_VELOCITY_SCALE_RAD_PER_S = 2.0
+"""The unit of angular velocities."""
+
 SLOWEST_TRACK_M_PER_S = 0.05
-NODE_SCALE_M, FARTHEST_NODE = 0.5, 4.0
+"""Below this speed of the centre of mass its direction means little, and fades."""
+
+NODE_SCALE_M = 0.5
+"""The unit of nodes."""
+
+FARTHEST_NODE = 4.0
+"""In that unit: 2 m from the centre of mass, where nodes never are."""
 
 
 def observe(

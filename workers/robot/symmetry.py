@@ -31,7 +31,7 @@ def _elements() -> tuple[Array, Labels]:
     """Every orthogonal matrix that permutes the nodes and keeps the cables: images of one Delta decide it."""
     cables = {frozenset(map(int, pair)) for pair in CABLES}
     base = np.linalg.inv(NODES_M[FACES[0]].T)
-    found: list[tuple[bool, Array, Labels]] = []
+    elements: list[tuple[bool, Array, Labels]] = []
     for face in FACES[FACE_KINDS == DELTA]:
         for corners in permutations(face):
             matrix = NODES_M[list(corners)].T @ base
@@ -39,9 +39,9 @@ def _elements() -> tuple[Array, Labels]:
             images = gaps.argmin(axis=1)
             keeps_nodes = len(set(images)) == NODES_N and gaps.min(axis=1).max() < 1e-9
             if keeps_nodes and all(frozenset((int(images[a]), int(images[b]))) in cables for a, b in CABLES):
-                found.append((bool(np.linalg.det(matrix) < 0), np.round(matrix), images))
-    found.sort(key=lambda item: (item[0], tuple(item[2])))
-    return np.array([matrix for _, matrix, _ in found]), np.array([images for _, _, images in found])
+                elements.append((bool(np.linalg.det(matrix) < 0), np.round(matrix), images))
+    elements.sort(key=lambda item: (item[0], tuple(item[2])))
+    return np.array([matrix for _, matrix, _ in elements]), np.array([images for _, _, images in elements])
 
 
 def _pair_map(pairs: Labels) -> Labels:
@@ -69,14 +69,23 @@ ELEMENTS_N = len(MATRICES)
 PROPER = np.linalg.det(MATRICES) > 0
 """Whether an element is a rotation [24]."""
 
-BAR_MAP, CABLE_MAP = _pair_map(BARS), _pair_map(CABLES)
-"""Images of bars [24, 6] and cables [24, 24]."""
+BAR_MAP = _pair_map(BARS)
+"""Images of bars [24, 6]."""
+
+CABLE_MAP = _pair_map(CABLES)
+"""Images of cables [24, 24]."""
 
 FACE_MAP, EDGE_MAP = _face_maps()
 """Images of faces [24, 20] and of their edges [24, 20, 3]."""
 
-NODES_FROM, BARS_FROM, CABLES_FROM = (np.argsort(m, axis=1) for m in (NODE_MAP, BAR_MAP, CABLE_MAP))
-"""Inverse maps: canonical[k] = world[FROM[g, k]]."""
+NODES_FROM = np.argsort(NODE_MAP, axis=1)
+"""Inverse map of nodes [24, 12]: canonical[k] = world[NODES_FROM[g, k]]."""
+
+BARS_FROM = np.argsort(BAR_MAP, axis=1)
+"""Inverse map of bars [24, 6]."""
+
+CABLES_FROM = np.argsort(CABLE_MAP, axis=1)
+"""Inverse map of cables [24, 24]."""
 
 REFERENCE_FACE = np.array([int(np.flatnonzero(kind == FACE_KINDS)[0]) for kind in (DELTA, LAMBDA)])
 """Reference face of each kind [2]."""
@@ -110,6 +119,7 @@ def _reference_triangles() -> Array:
 
 
 REFERENCE_TRIANGLES_M = _reference_triangles()
+"""Horizontal corners of each kind's triangle in the reference orientation [2, 3, 2] (m)."""
 
 
 def frame_yaw(nodes: Array, face: int, element: int) -> float:

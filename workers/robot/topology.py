@@ -13,8 +13,18 @@ import numpy as np
 from numpy.typing import NDArray
 
 BAR_LENGTH_M = 1.94
-BARS_N, NODES_N, CABLES_N, FACES_N = 6, 12, 24, 20
-DELTA, LAMBDA = 0, 1
+"""As in the paper."""
+
+BARS_N = 6
+NODES_N = 12
+CABLES_N = 24
+FACES_N = 20
+
+DELTA = 0
+"""Kind of a closed face."""
+
+LAMBDA = 1
+"""Kind of an open face."""
 
 
 def _neutral_nodes() -> NDArray[np.float64]:

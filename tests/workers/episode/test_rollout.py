@@ -3,8 +3,8 @@
 import pickle
 import subprocess
 import sys
-from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from itertools import pairwise
 
 import numpy as np
@@ -19,11 +19,13 @@ from t6gps.workers.episode.exploration import noise
 from t6gps.workers.episode.recording import canonical_vectors, stuck_share_by_distance
 from t6gps.workers.episode.start import SETTLE_STEPS
 from t6gps.workers.episode.task import AREA_HALF_WIDTH_M, WAYPOINT_RADIUS_M, Course, random_waypoints, running_cost
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.ground.terrain import Terrain
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.engine import Engine
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.symmetry import CABLES_FROM, NODE_MAP, NODES_FROM, world_map
 from t6gps.workers.robot.topology import NEIGHBOR_FACE
-from t6gps.workers.settings import RolloutSettings, TaskSettings
+from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings
 from t6gps.workers.worker import RolloutWorker
 
 FRESH_PROCESS = """
@@ -233,36 +235,44 @@ def test_the_cost_vanishes_at_the_target_velocity_and_weighs_the_vertical_less()
     assert running_cost(wanted + [0, 0, 1.0], direction, settings) == pytest.approx(settings.vertical_weight)
 
 
-@pytest.fixture
-def failing_worker(monkeypatch: pytest.MonkeyPatch) -> Callable[[PhysicsError], RolloutWorker]:
-    """A worker whose simulation raises the given error in the 13th control step of the episode."""
-    sound = Simulation.control_step
+class Failing(Engine):
+    """Another engine that raises an error in the 13th control step of each episode."""
 
-    def make(error: PhysicsError) -> RolloutWorker:
-        calls = iter(range(1000))
+    def __init__(self, robot: RobotSettings, error: PhysicsError) -> None:
+        self.robot, self._error = robot, error
+        self._engine = PyBulletEngine(robot)
 
-        def failing(simulation: Simulation, command: Array) -> RobotState:
-            if next(calls) == SETTLE_STEPS + 12:
-                raise error
-            return sound(simulation, command)
+    def set_ground(self, terrain: Terrain | None) -> None:
+        self._engine.set_ground(terrain)
+        self._steps_n = 0
 
-        monkeypatch.setattr(Simulation, "control_step", failing)
-        return RolloutWorker(RolloutSettings())
+    def reset(self, state: RobotState) -> None:
+        self._engine.reset(state)
 
-    return make
+    def state(self) -> RobotState:
+        return self._engine.state()
+
+    def control_step(self, command: Array) -> RobotState:
+        self._steps_n += 1
+        if self._steps_n == SETTLE_STEPS + 13:
+            raise self._error
+        return self._engine.control_step(command)
+
+    def close(self) -> None:
+        self._engine.close()
 
 
-def test_an_unsound_state_ends_the_episode_before_it_and_is_named(
-    failing_worker: Callable[[PhysicsError], RolloutWorker],
-) -> None:
+def failing_worker(error: PhysicsError) -> RolloutWorker:
+    return RolloutWorker(RolloutSettings(), partial(Failing, error=error))
+
+
+def test_an_unsound_state_ends_the_episode_before_it_and_is_named() -> None:
     episode = failing_worker(UnsoundStateError("a node moves too fast", "unstable")).run(PLAN, random_policy())
     assert episode.summary["ended_by"][0].as_py() == "unstable"
     assert episode.summary["steps"][0].as_py() == 12
     assert episode.frames["action"].null_count == 1
 
 
-def test_a_broken_simulator_is_an_error_and_not_the_end_of_an_episode(
-    failing_worker: Callable[[PhysicsError], RolloutWorker],
-) -> None:
+def test_a_broken_simulator_is_an_error_and_not_the_end_of_an_episode() -> None:
     with pytest.raises(PhysicsError, match="no plugin"):
         failing_worker(PhysicsError("no plugin")).run(PLAN, random_policy())

@@ -1,16 +1,16 @@
 """A law of the episode in progress that neither its record nor the environment shows alone."""
 
 from t6gps.workers.episode.running import RunningEpisode
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings
 
 
 def test_for_a_robot_at_rest_the_waypoint_changes_once_per_timeout() -> None:
     robot, task = RobotSettings(), TaskSettings(waypoint_timeout_s=1.0)
     active = []
-    with Simulation(robot) as simulation:
+    with PyBulletEngine(robot) as engine:
         episode = RunningEpisode(
-            simulation,
+            engine,
             RolloutSettings(robot=robot, task=task),
             seed=0,
             terrain_seed=0,

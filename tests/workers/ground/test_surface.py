@@ -11,7 +11,8 @@ from t6gps.storage.errors import TerrainError
 from t6gps.workers.ground.ground import FENCE_HEIGHT_M, fenced, ground, tilted
 from t6gps.workers.ground.surface import load
 from t6gps.workers.ground.terrain import Terrain, generate
-from t6gps.workers.physics.simulation import Simulation, neutral_state
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.settings import RobotSettings, TerrainSettings
 
 HILLS = generate(4, 1.0, 10.0)
@@ -105,11 +106,11 @@ def test_a_robot_thrown_at_the_fence_stays_inside() -> None:
     robot = RobotSettings()
     terrain = fenced(generate(0, 0.0, 10.0))
     assert terrain.heights.max() == FENCE_HEIGHT_M
-    with Simulation(robot) as simulation:
+    with PyBulletEngine(robot) as engine:
         for direction in ([2.0, 0.0, 0.0], [-2.0, 2.0, 0.0]):
-            simulation.set_ground(terrain)
+            engine.set_ground(terrain)
             start = neutral_state(robot).but(bar_velocities=np.tile(direction, (6, 1)))
-            simulation.reset(start)
+            engine.reset(start)
             for _ in range(60):
-                state = simulation.control_step(start.rest_lengths)
+                state = engine.control_step(start.rest_lengths)
             assert np.abs(state.com[:2]).max() < terrain.half_size_m

@@ -21,10 +21,12 @@ from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers.bench.mujoco import mujoco_speed
 from t6gps.workers.episode.start import turn
 from t6gps.workers.ground.terrain import Terrain, generate
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.cables import tensions
+from t6gps.workers.physics.engine import Engine
 from t6gps.workers.physics.mjcf import to_mjcf
-from t6gps.workers.physics.mujoco_engine import MujocoSimulation
-from t6gps.workers.physics.reference import tensions
-from t6gps.workers.physics.simulation import Simulation, neutral_state, nominal_rest_length
+from t6gps.workers.physics.mujoco_engine import MujocoEngine
+from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.support import support_face
 from t6gps.workers.robot.topology import CABLES_N, FACES, FACES_N, NODES_M
@@ -35,19 +37,19 @@ ROBOT = RobotSettings()
 HOLD = np.full(CABLES_N, nominal_rest_length(ROBOT))
 ROUGH = generate(1, 1.0)
 
-Engines = tuple[Simulation, Simulation]
+Engines = tuple[Engine, Engine]
 
 
 @pytest.fixture(scope="module")
 def engines() -> Iterator[Engines]:
     """PyBullet and MuJoCo with the same robot on the plane."""
-    with Simulation(ROBOT) as bullet, MujocoSimulation(ROBOT) as second:
+    with PyBulletEngine(ROBOT) as bullet, MujocoEngine(ROBOT) as second:
         yield bullet, second
 
 
-def _motion(simulation: Simulation, start: RobotState, commands: Array) -> list[RobotState]:
-    simulation.reset(start)
-    return [simulation.state(), *(simulation.control_step(command) for command in commands)]
+def _motion(engine: Engine, start: RobotState, commands: Array) -> list[RobotState]:
+    engine.reset(start)
+    return [engine.state(), *(engine.control_step(command) for command in commands)]
 
 
 def _lowest_at(state: RobotState, height_m: float) -> RobotState:
@@ -116,8 +118,8 @@ def rough_fall(engines: Engines, seed: int) -> float:
     nodes = state.nodes()
     lift = (ROUGH.height(nodes[:, 0], nodes[:, 1]) - nodes[:, 2]).max() + 0.2
     start = state.but(bar_positions=state.bar_positions + [0.0, 0.0, lift])
-    one, other = (_motion(engine, start, np.tile(HOLD, (10, 1)))[-1].com for engine in engines)
-    return float(np.linalg.norm(one - other))
+    bullet, second = (_motion(engine, start, np.tile(HOLD, (10, 1)))[-1].com for engine in engines)
+    return float(np.linalg.norm(bullet - second))
 
 
 # Agreement of the engines
@@ -134,9 +136,9 @@ def test_flight_with_slack_cables_agrees_to_rounding(engines: Engines, seed: int
     )
     assert (tensions(start, ROBOT)[0] == 0.0).sum() >= 5
     commands = rng.uniform(ROBOT.shortest_command_m, ROBOT.longest_command_m, (10, CABLES_N))
-    one, other = (_motion(engine, start, commands)[-1] for engine in engines)
-    np.testing.assert_allclose(other.nodes(), one.nodes(), atol=1e-11)
-    np.testing.assert_allclose(other.node_velocities(), one.node_velocities(), atol=1e-10)
+    bullet, second = (_motion(engine, start, commands)[-1] for engine in engines)
+    np.testing.assert_allclose(second.nodes(), bullet.nodes(), atol=1e-11)
+    np.testing.assert_allclose(second.node_velocities(), bullet.node_velocities(), atol=1e-10)
 
 
 @pytest.mark.parametrize(
@@ -187,7 +189,7 @@ def test_rolling_robots_change_triangles_alike(engines: Engines) -> None:
 
 def test_a_robot_falls_alike_on_rough_ground() -> None:
     """Measured over 40 falls: CoM gap after 1 s 1.8 cm (median), 6 cm (90 %), 22 cm (worst)."""
-    with Simulation(ROBOT) as bullet, MujocoSimulation(ROBOT) as second:
+    with PyBulletEngine(ROBOT) as bullet, MujocoEngine(ROBOT) as second:
         bullet.set_ground(ROUGH)
         second.set_ground(ROUGH)
         gaps = [rough_fall((bullet, second), seed) for seed in range(6)]
@@ -214,35 +216,35 @@ def test_both_engines_stand_on_the_same_surface() -> None:
 @pytest.mark.parametrize("ground", [None, ROUGH], ids=["flat", "rough"])
 def test_a_reset_forgets_the_past(ground: Terrain | None) -> None:
     commands = np.random.default_rng(0).uniform(0.65, 1.35, (20, CABLES_N))
-    with MujocoSimulation(ROBOT) as simulation:
-        simulation.set_ground(ground)
-        lying = _motion(simulation, neutral_state(ROBOT, 1.6), commands)[-1]
-        first = _motion(simulation, lying, commands[:5])[-1]
-        again = _motion(simulation, lying, commands[:5])[-1]
+    with MujocoEngine(ROBOT) as engine:
+        engine.set_ground(ground)
+        lying = _motion(engine, neutral_state(ROBOT, 1.6), commands)[-1]
+        first = _motion(engine, lying, commands[:5])[-1]
+        again = _motion(engine, lying, commands[:5])[-1]
     np.testing.assert_array_equal(first.nodes(), again.nodes())
 
 
 def test_a_reset_gives_the_state_back() -> None:
     rng = np.random.default_rng(1)
     start = turn(on_face(3), np.array([0.5, 0.5, 0.5, 0.5])).but(bar_angular_velocities=rng.normal(size=(6, 3)))
-    with MujocoSimulation(ROBOT) as simulation:
-        simulation.reset(start)
-        for name, value in vars(simulation.state()).items():
+    with MujocoEngine(ROBOT) as engine:
+        engine.reset(start)
+        for name, value in vars(engine.state()).items():
             np.testing.assert_allclose(value, getattr(start, name), atol=1e-12, err_msg=name)
 
 
 def test_unsound_states_are_refused_as_in_the_first_engine() -> None:
-    with MujocoSimulation(ROBOT) as simulation:
-        simulation.reset(neutral_state(ROBOT, 50.0).but(bar_velocities=np.full((6, 3), 80.0)))
+    with MujocoEngine(ROBOT) as engine:
+        engine.reset(neutral_state(ROBOT, 50.0).but(bar_velocities=np.full((6, 3), 80.0)))
         with pytest.raises(PhysicsError, match="became unstable"):
-            simulation.control_step(HOLD)
-        simulation.set_ground(generate(0, 0.5, 10.0))
+            engine.control_step(HOLD)
+        engine.set_ground(generate(0, 0.5, 10.0))
         start = neutral_state(ROBOT, 1.6)
-        simulation.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
+        engine.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
         with pytest.raises(PhysicsError, match="beyond the ground's side at 5"):
-            simulation.control_step(HOLD)
+            engine.control_step(HOLD)
     with pytest.raises(PhysicsError, match=r"must divide the control step.*choose"):
-        MujocoSimulation(ROBOT.model_copy(update={"physics_step_s": 0.003}))
+        MujocoEngine(ROBOT.model_copy(update={"physics_step_s": 0.003}))
 
 
 def test_without_mujoco_the_error_names_the_extra() -> None:
@@ -256,7 +258,7 @@ def test_an_episode_runs_on_the_second_engine() -> None:
     layer = (rng.normal(0.0, 0.3, (CABLES_N, OBSERVATION_N)).astype(np.float32), np.zeros(CABLES_N, np.float32))
     snapshot = PolicySnapshot(0, (layer,), nominal_rest_length(ROBOT), 0.2)
     plan = EpisodePlan(0, 0, 0, 3, 20, 5, 0.5, 0.1, 0)
-    worker = RolloutWorker(settings, MujocoSimulation)
+    worker = RolloutWorker(settings, MujocoEngine)
     first, again = worker.run(plan, snapshot), worker.run(plan, snapshot)
     worker.close()
     assert first.summary["ended_by"].to_pylist() == ["completed"]
@@ -331,8 +333,8 @@ def test_eval_runs_on_the_second_engine(tmp_path: Path) -> None:
     settings = [f"--set={item}" for item in tiny]
     _t6gps("train", "flat-quick", "--run", "tiny", "--serial", "--root", tmp_path, *settings)
     arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", tmp_path)
-    one = json.loads(_t6gps(*arguments).stdout)
-    other = json.loads(_t6gps(*arguments, "--engine", "mujoco").stdout)
-    assert one.keys() == other.keys()
-    assert one["cost"] != other["cost"]
-    assert one["cost"]["mean"] == pytest.approx(other["cost"]["mean"], abs=0.2)
+    bullet = json.loads(_t6gps(*arguments).stdout)
+    second = json.loads(_t6gps(*arguments, "--engine", "mujoco").stdout)
+    assert bullet.keys() == second.keys()
+    assert bullet["cost"] != second["cost"]
+    assert bullet["cost"]["mean"] == pytest.approx(second["cost"]["mean"], abs=0.2)

@@ -6,7 +6,7 @@ import pytest
 from t6gps.workers.episode.start import random_start
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.physics import observer
-from t6gps.workers.physics.simulation import Simulation
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.robot.observation import observe
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, enter, support_face
@@ -18,12 +18,12 @@ from t6gps.workers.settings import RobotSettings
 def states() -> list[RobotState]:
     """States of random motion from several starts: all faces and elements come up."""
     robot, rng = RobotSettings(winch_speed_m_per_s=1.5, shortest_command_m=0.5), np.random.default_rng(0)
-    found = []
-    with Simulation(robot) as simulation:
+    states = []
+    with PyBulletEngine(robot) as engine:
         for _ in range(12):
-            random_start(simulation, robot, None, rng)
-            found += [simulation.control_step(rng.uniform(0.5, 1.35, 24)) for _ in range(60)]
-    return found
+            random_start(engine, robot, None, rng)
+            states += [engine.control_step(rng.uniform(0.5, 1.35, 24)) for _ in range(60)]
+    return states
 
 
 def test_survey_finds_the_support_face_and_the_centre_of_mass(states: list[RobotState]) -> None:

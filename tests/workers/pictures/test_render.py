@@ -13,11 +13,11 @@ from PIL import Image
 from t6gps.storage import schema
 from t6gps.storage.errors import ConfigError
 from t6gps.workers.ground.terrain import Terrain, generate
-from t6gps.workers.physics.simulation import neutral_state
 from t6gps.workers.pictures import scene
 from t6gps.workers.pictures.landscape import Landscape
 from t6gps.workers.pictures.raycast import Camera, cast_ground, cast_rods, cast_shadow
 from t6gps.workers.pictures.render import render, snapshots, still
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.settings import RobotSettings
 
 SMALL = (160, 90)

@@ -3,18 +3,22 @@
 from __future__ import annotations
 
 import ctypes
+import os
 import subprocess
 import sys
 from functools import partial
 from pathlib import Path
 
 import numpy as np
+import pytest
 from numpy.typing import NDArray
 
+from t6gps.storage.errors import PhysicsError
 from t6gps.workers.ground.terrain import generate
-from t6gps.workers.physics import overrides, simulation
 from t6gps.workers.physics.bullet import pybullet
-from t6gps.workers.physics.simulation import Simulation, neutral_state
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.bullet_hooks import overrides
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings
 
@@ -43,12 +47,12 @@ class _Closest(ctypes.Structure):
 
 def _closest(start: Array, along: Array, corners: Array, reach_m: float = np.inf) -> _Closest | None:
     """Closest points of a segment and a triangle, None if they are farther apart than `reach_m`."""
-    padded, found = np.zeros((3, 4)), _Closest()
+    padded, closest = np.zeros((3, 4)), _Closest()
     padded[:, :3] = corners
     pointers = [array.ctypes.data_as(ctypes.c_void_p) for array in (start, along, padded)]
     library = ctypes.CDLL(str(overrides.library_path()))
-    near = library.closest_points(*pointers, ctypes.c_double(reach_m), ctypes.byref(found))
-    return found if near else None
+    near = library.closest_points(*pointers, ctypes.c_double(reach_m), ctypes.byref(closest))
+    return closest if near else None
 
 
 def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
@@ -58,15 +62,15 @@ def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
     for _ in range(300):
         start, along, corners = rng.normal(size=3), rng.normal(size=3), rng.normal(size=(3, 3))
         sampled = _distances(start + shares * along, corners).min()
-        found = _closest(start, along, corners)
-        assert found is not None
-        distance = np.sqrt(found.distance2)
+        closest = _closest(start, along, corners)
+        assert closest is not None
+        distance = np.sqrt(closest.distance2)
         step = np.linalg.norm(along) / 2000  # no point of the segment is farther from a sampled one
         assert sampled - step - 1e-9 <= distance <= sampled + 1e-9
         if distance == 0:
             crossing += 1
             continue
-        on_segment, on_triangle = np.array(found.on_segment), np.array(found.on_triangle)
+        on_segment, on_triangle = np.array(closest.on_segment), np.array(closest.on_triangle)
         assert np.isclose(np.linalg.norm(on_segment - on_triangle), distance, rtol=1e-12, atol=0)
         assert _distances(on_triangle[None], corners)[0] < 1e-12
         share = (on_segment - start) @ along / (along @ along)
@@ -80,21 +84,21 @@ def test_closest_points_are_nearer_than_any_sampled_ones() -> None:
 def test_a_segment_along_a_triangle_has_its_distance() -> None:
     corners = np.array([[0.0, 0.0, 0.0], [1.0, 0.0, 0.0], [0.0, 1.0, 0.0]])
     for y in (0.2, 0.0):  # over the middle of the triangle, and over one of its edges
-        found = _closest(np.array([-5.0, y, 0.04]), np.array([10.0, 0.0, 0.0]), corners)
-        assert found is not None
-        assert np.isclose(np.sqrt(found.distance2), 0.04, rtol=1e-12)
+        closest = _closest(np.array([-5.0, y, 0.04]), np.array([10.0, 0.0, 0.0]), corners)
+        assert closest is not None
+        assert np.isclose(np.sqrt(closest.distance2), 0.04, rtol=1e-12)
 
 
 def _motion() -> Array:
     """Positions of the bars over 2 s on three rough grounds and on the plane [4, 20, 6, 3] (m)."""
     rng = np.random.default_rng(3)
     motions = []
-    with Simulation(RobotSettings()) as simulation:
+    with PyBulletEngine(RobotSettings()) as engine:
         for terrain in [*(generate(seed, 1.0) for seed in range(3)), None]:
-            simulation.set_ground(terrain)
-            simulation.reset(neutral_state(simulation.robot, 1.9))
+            engine.set_ground(terrain)
+            engine.reset(neutral_state(engine.robot, 1.9))
             commands = rng.uniform(0.5, 1.5, (20, CABLES_N))
-            motions.append([simulation.control_step(command).bar_positions for command in commands])
+            motions.append([engine.control_step(command).bar_positions for command in commands])
     return np.array(motions)
 
 
@@ -143,18 +147,28 @@ def _motions() -> dict[str, Array]:
 
 def test_motion_is_that_of_bullet_alone(tmp_path: Path) -> None:
     assert overrides.take_over()
-    subprocess.run([sys.executable, __file__, tmp_path / "own.npz"], check=True)
-    with np.load(tmp_path / "own.npz") as own:
+    bare = {**os.environ, "T6GPS_PHYSICS": "bullet"}
+    subprocess.run([sys.executable, __file__, tmp_path / "bare.npz"], env=bare, check=True)
+    with np.load(tmp_path / "bare.npz") as motions:
         for name, motion in _motions().items():
-            assert np.abs(own[name] - motion).max() < 1e-9, name
+            assert np.abs(motions[name] - motion).max() < 1e-9, name
+
+
+def test_overrides_say_whether_they_are_active_and_exclude_bullet_alone() -> None:
+    assert overrides.take_over()
+    assert overrides.active() == {"contacts": True, "solver": True}
+    with pytest.raises(PhysicsError, match="has overridden its contacts and its solver; set the variable before"):
+        PyBulletEngine(RobotSettings(), "bullet")
 
 
 def test_a_library_without_bullet_has_none_of_its_symbols() -> None:
     path = overrides.library_path()
     assert path is not None
-    assert set(overrides._symbols(path, ["closest_points", "_ZTV24btConvexTriangleCallback"])) == {"closest_points"}
+    names = ["closest_points", "_ZTV24btConvexTriangleCallback"]
+    assert set(overrides.symbol_values(path, names)) == {"closest_points"}
 
 
 if __name__ == "__main__":
-    simulation.take_over = lambda: False
+    assert not any(overrides.active().values())
     np.savez(sys.argv[1], **_motions())
+    assert not any(overrides.active().values())

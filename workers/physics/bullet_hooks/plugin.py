@@ -1,4 +1,4 @@
-"""The binding of native/stepper.c, which computes the law of reference.py inside Bullet."""
+"""The binding of native/stepper.c, which computes the law of physics/cables.py inside Bullet."""
 
 from __future__ import annotations
 
@@ -42,9 +42,9 @@ _BLOCK = np.dtype(
 )
 
 
-def library_path() -> Path:
-    """The compiled plugin beside this file. Raises PhysicsError if it was not built."""
-    candidates = [Path(__file__).with_name(f"_stepper{suffix}") for suffix in EXTENSION_SUFFIXES]
+def library_path(folder: Path = Path(__file__).parent) -> Path:
+    """The compiled plugin in `folder`. Raises PhysicsError if it was not built."""
+    candidates = [folder / f"_stepper{suffix}" for suffix in EXTENSION_SUFFIXES]
     for candidate in candidates:
         if candidate.exists():
             return candidate
@@ -52,9 +52,14 @@ def library_path() -> Path:
 
 
 class PluginStepper:
-    """Steps a client by one call per control step; the numbers are exchanged in one block of memory."""
+    """Steps a client by one call per control step; the numbers are exchanged in one block of memory.
 
-    def __init__(self, client: int, robot: RobotSettings, steps_n: int) -> None:
+    Bullet's functions are looked up in `bullet_library`, which the process must have loaded.
+    """
+
+    def __init__(
+        self, client: int, robot: RobotSettings, steps_n: int, bullet_library: str = pybullet.__file__
+    ) -> None:
         self._client = client
         self._block = np.zeros((), _BLOCK)
         self._block["winch_step_m"] = robot.winch_speed_m_per_s * robot.physics_step_s
@@ -71,7 +76,7 @@ class PluginStepper:
             raise PhysicsError(f"Bullet cannot load the physics plugin {path}; {_REMEDY}")
         address = self._block.ctypes.data
         halves = np.array([address & 0xFFFFFFFF, address >> 32], dtype=np.uint32).view(np.int32)
-        self._call(pybullet.__file__, [_BLOCK.itemsize, *halves.tolist()])
+        self._call(bullet_library, [_BLOCK.itemsize, *halves.tolist()])
 
     def _call(self, text: str, integers: list[int]) -> None:
         result = pybullet.executePluginCommand(self._plugin, text, intArgs=integers, physicsClientId=self._client)

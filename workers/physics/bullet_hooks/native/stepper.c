@@ -1,7 +1,7 @@
 /*
  * One control step of the robot inside Bullet: a plugin for pybullet.loadPlugin(path, "_t6gps").
  *
- * The law is that of workers/physics/reference.py, operation by operation, so that both give the same bits: in every physics
+ * The law is that of workers/physics/cables.py, operation by operation, so that both give the same bits: in every physics
  * step (1) the winches move, (2) the bars are read, (3) forces are computed and applied, (4) Bullet steps.
  *
  * Python owns the data (struct block) and binds it once by address. Bullet's C functions come from the library of
@@ -35,7 +35,7 @@ struct b3PluginArguments {
     double floats[128];
 };
 
-/* Shared with workers/physics/plugin.py (BLOCK): the same fields in the same order. */
+/* Shared with workers/physics/bullet_hooks/plugin.py (_BLOCK): the same fields in the same order. */
 struct block {
     double winch_step_m, stiffness, damping, max_tension, axial_damping, bar_length;
     double command[CABLES], rest[CABLES];

@@ -14,18 +14,27 @@ import numpy as np
 from t6gps.workers.physics.bullet import pybullet
 
 _EXPORTED = "b3InitStepSimulationCommand"
+"""A function whose address the loader tells; the others lie at fixed distances from it."""
+
 _OVERRIDES = {
-    "override_triangles": (
+    "contacts": (
+        "override_triangles",
         "_ZTV24btConvexTriangleCallback",
         "_ZN24btConvexTriangleCallback15processTriangleEP9btVector3ii",
     ),
-    "override_iterations": (
+    "solver": (
+        "override_iterations",
         "_ZTV27btMultiBodyConstraintSolver",
         "_ZN35btSequentialImpulseConstraintSolver33solveGroupCacheFriendlyIterationsEPP17btCollisionObjectiPP20"
         "btPersistentManifoldiPP17btTypedConstraintiRK19btContactSolverInfoP12btIDebugDraw",
     ),
 }
-"""Functions that install an override: the symbols of Bullet's table of virtual functions and of the one replaced."""
+"""By name: our function that installs it, and the symbols of Bullet's table of virtual functions and of the function
+that is replaced."""
+
+_ENTRIES_N = 32
+"""Entries of a table that are looked through, as in native/override.c."""
+
 _SYMBOL = np.dtype(
     [("name", "<u4"), ("info", "u1"), ("other", "u1"), ("section", "<u2"), ("value", "<u8"), ("size", "<u8")]
 )
@@ -44,17 +53,40 @@ def take_over() -> bool:
 
     False where it cannot be done: they were not built, or this build of pybullet is not the one they were made for.
     """
-    path, symbols = library_path(), [_EXPORTED, *chain(*_OVERRIDES.values())]
-    values = _symbols(Path(pybullet.__file__), symbols)
-    if path is None or len(values) < len(symbols):
+    path, addresses = library_path(), _addresses()
+    if path is None or not addresses:
         return False
-    exported = ctypes.cast(getattr(ctypes.CDLL(pybullet.__file__), _EXPORTED), ctypes.c_void_p).value or 0
-    addresses = {symbol: ctypes.c_void_p(exported - values[_EXPORTED] + value) for symbol, value in values.items()}
     library = ctypes.CDLL(str(path))
-    return all(library[name](addresses[table], addresses[function]) for name, (table, function) in _OVERRIDES.items())
+    return all(
+        library[install](ctypes.c_void_p(addresses[table]), ctypes.c_void_p(addresses[function]))
+        for install, table, function in _OVERRIDES.values()
+    )
 
 
-def _symbols(library: Path, names: list[str]) -> dict[str, int]:
+def active() -> dict[str, bool]:
+    """Whether each override is in place in this process, as Bullet's own tables say."""
+    addresses = _addresses()
+    if not addresses:
+        return dict.fromkeys(_OVERRIDES, False)
+    tables = {
+        name: (ctypes.c_size_t * _ENTRIES_N).from_address(addresses[table])
+        for name, (_, table, _) in _OVERRIDES.items()
+    }
+    return {name: addresses[function] not in tables[name] for name, (_, _, function) in _OVERRIDES.items()}
+
+
+@cache
+def _addresses() -> dict[str, int]:
+    """Addresses of Bullet's tables and functions in this process, none if its library does not tell them all."""
+    symbols = [_EXPORTED, *chain(*(pair for _, *pair in _OVERRIDES.values()))]
+    values = symbol_values(Path(pybullet.__file__), symbols)
+    if len(values) < len(symbols):
+        return {}
+    exported = ctypes.cast(getattr(ctypes.CDLL(pybullet.__file__), _EXPORTED), ctypes.c_void_p).value or 0
+    return {symbol: exported - values[_EXPORTED] + value for symbol, value in values.items()}
+
+
+def symbol_values(library: Path, names: list[str]) -> dict[str, int]:
     """Values of those of `names` that the symbol table of an ELF file of 64 bits holds."""
     content = np.memmap(library, np.uint8, mode="r")
     header = content[:64].tobytes()

@@ -6,6 +6,7 @@ import hashlib
 import subprocess
 import sys
 import tracemalloc
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -13,28 +14,19 @@ import pytest
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.episode.start import turn
 from t6gps.workers.ground.terrain import Terrain, generate
-from t6gps.workers.physics import plugin, simulation
-from t6gps.workers.physics.bullet import pybullet
-from t6gps.workers.physics.reference import loads, tensions
-from t6gps.workers.physics.simulation import (
-    CONTROL_STEP_S,
-    GRAVITY_M_PER_S2,
-    Simulation,
-    neutral_state,
-    nominal_rest_length,
-)
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.bullet_hooks import plugin
+from t6gps.workers.physics.engine import CONTROL_STEP_S, GRAVITY_M_PER_S2
 from t6gps.workers.robot import symmetry
+from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.topology import (
     BAR_LENGTH_M,
-    BARS,
-    CABLES,
     CABLES_N,
     DELTA,
     FACE_KINDS,
     FACES,
     NODES_M,
-    NODES_N,
 )
 from t6gps.workers.settings import RobotSettings
 
@@ -51,9 +43,9 @@ def _commands(steps: int, seed: int = 0) -> Array:
     return np.random.default_rng(seed).uniform(low, high, (steps, CABLES_N))
 
 
-def _run(simulation: Simulation, start: RobotState, commands: Array) -> list[RobotState]:
-    simulation.reset(start)
-    return [simulation.control_step(command) for command in commands]
+def _run(engine: PyBulletEngine, start: RobotState, commands: Array) -> list[RobotState]:
+    engine.reset(start)
+    return [engine.control_step(command) for command in commands]
 
 
 def _start(ground: Terrain | None) -> RobotState:
@@ -80,52 +72,6 @@ def _stirred(state: RobotState, seed: int) -> RobotState:
     )
 
 
-# The law of the cables
-
-
-def test_cables_never_push_and_keep_their_bounds() -> None:
-    rng = np.random.default_rng(0)
-    for seed in range(50):
-        state = _stirred(neutral_state(ROBOT), seed)
-        state = state.but(rest_lengths=rng.uniform(0.2, 1.4, CABLES_N))
-        tension, _ = tensions(state, ROBOT)
-        nodes = state.nodes()
-        lengths = np.linalg.norm(nodes[CABLES[:, 1]] - nodes[CABLES[:, 0]], axis=1)
-        elastic = ROBOT.cable_stiffness_n_per_m * np.maximum(0.0, lengths - state.rest_lengths)
-        assert (tension >= 0.0).all()
-        assert (tension <= np.minimum(2 * elastic, ROBOT.cable_max_tension_n) + 1e-9).all()
-        assert (tension[lengths < state.rest_lengths] == 0.0).all()
-
-
-def test_the_neutral_shape_is_in_equilibrium_with_bars_compressed_by_root_6_tensions() -> None:
-    state = neutral_state(ROBOT)
-    tension, pull = tensions(state, ROBOT)
-    np.testing.assert_allclose(tension, ROBOT.pretension_n)
-    forces, torques = loads(state, ROBOT)
-    np.testing.assert_allclose(forces, 0.0, atol=1e-9)
-    np.testing.assert_allclose(torques, 0.0, atol=1e-9)
-    pulls = np.zeros((NODES_N, 3))
-    np.add.at(pulls, CABLES[:, 0], pull)
-    np.add.at(pulls, CABLES[:, 1], -pull)
-    nodes = state.nodes()
-    inward = (nodes[BARS[:, 1]] - nodes[BARS[:, 0]]) / BAR_LENGTH_M
-    np.testing.assert_allclose((pulls[BARS[:, 0]] * inward).sum(axis=1), np.sqrt(6) * ROBOT.pretension_n, rtol=1e-12)
-
-
-def test_loads_sum_to_no_force_and_no_torque_on_the_robot() -> None:
-    robot = ROBOT.model_copy(update={"axial_damping_n_m_s": 0.0})
-    state = _stirred(neutral_state(robot), 3)
-    forces, torques = loads(state, robot)
-    np.testing.assert_allclose(forces.sum(axis=0), 0.0, atol=1e-9)
-    np.testing.assert_allclose((torques + np.cross(state.bar_positions, forces)).sum(axis=0), 0.0, atol=1e-9)
-
-
-def test_neutral_state_has_the_nodes_of_the_topology() -> None:
-    state = neutral_state(ROBOT, 2.0)
-    np.testing.assert_allclose(state.nodes(), NODES_M + [0.0, 0.0, 2.0], atol=1e-12)
-    assert (state.rest_lengths == nominal_rest_length(ROBOT)).all()
-
-
 # Plugin and reference
 
 
@@ -134,18 +80,18 @@ def test_plugin_equals_reference_to_the_last_bit(ground: Terrain | None, steps: 
     commands = _commands(steps)
     trajectories = []
     for stepper in ("plugin", "reference"):
-        with Simulation(ROBOT, stepper) as simulation:
-            simulation.set_ground(ground)
-            trajectories.append(_run(simulation, _start(ground), commands))
+        with PyBulletEngine(ROBOT, stepper) as engine:
+            engine.set_ground(ground)
+            trajectories.append(_run(engine, _start(ground), commands))
     for fast, plain in zip(*trajectories, strict=True):
         np.testing.assert_array_equal(_numbers(fast), _numbers(plain))
 
 
 def test_several_simulations_in_one_process_do_not_disturb_each_other() -> None:
     commands = _commands(10)
-    with Simulation(ROBOT) as alone:
+    with PyBulletEngine(ROBOT) as alone:
         expected = _run(alone, _start(None), commands)
-    with Simulation(ROBOT) as first, Simulation(ROBOT.model_copy(update={"bar_mass_kg": 4.0})) as second:
+    with PyBulletEngine(ROBOT) as first, PyBulletEngine(ROBOT.model_copy(update={"bar_mass_kg": 4.0})) as second:
         first.reset(_start(None))
         second.reset(_start(None))
         for command, state in zip(commands, expected, strict=True):
@@ -174,14 +120,14 @@ def _image(state: RobotState, element: int, yaw: float) -> RobotState:
 
 
 @pytest.fixture(scope="module")
-def flat() -> Simulation:
-    return Simulation(ROBOT)
+def flat() -> PyBulletEngine:
+    return PyBulletEngine(ROBOT)
 
 
 @pytest.mark.parametrize("element", range(24))
 @pytest.mark.parametrize(("height_m", "tolerance_m"), [(50.0, 1e-9), (1.07, 0.02)], ids=["in flight", "on the ground"])
 def test_dynamics_commute_with_every_symmetry(
-    flat: Simulation, element: int, height_m: float, tolerance_m: float
+    flat: PyBulletEngine, element: int, height_m: float, tolerance_m: float
 ) -> None:
     """Over 0.5 s; exact in flight. On the ground Bullet solves contacts in turns, which is no symmetric thing to do:
     nodes that moved some 0.5 m may then differ by up to 2 cm (docs/physics.md)."""
@@ -196,7 +142,7 @@ def test_dynamics_commute_with_every_symmetry(
     np.testing.assert_allclose(here.rest_lengths, there.rest_lengths, atol=1e-12)
 
 
-def test_free_flight_keeps_momentum(flat: Simulation) -> None:
+def test_free_flight_keeps_momentum(flat: PyBulletEngine) -> None:
     start = _stirred(neutral_state(ROBOT, 50.0), 1)
     seconds = 10 * CONTROL_STEP_S
     end = _run(flat, start, _commands(10))[-1]
@@ -209,21 +155,21 @@ def _angular_momentum(state: RobotState, robot: RobotSettings) -> Array:
     axes = (nodes[0::2] - nodes[1::2]) / BAR_LENGTH_M
     spin = (state.bar_angular_velocities * axes).sum(axis=1, keepdims=True) * axes
     transverse = robot.bar_mass_kg * BAR_LENGTH_M**2 / 12
-    own = transverse * (state.bar_angular_velocities - spin) + robot.axial_inertia_kg_m2 * spin
+    spins = transverse * (state.bar_angular_velocities - spin) + robot.axial_inertia_kg_m2 * spin
     orbit = np.cross(state.bar_positions - state.com, state.bar_velocities - state.com_velocity)
-    return np.asarray((own + robot.bar_mass_kg * orbit).sum(axis=0))
+    return np.asarray((spins + robot.bar_mass_kg * orbit).sum(axis=0))
 
 
 def test_free_flight_keeps_angular_momentum() -> None:
     robot = ROBOT.model_copy(update={"axial_damping_n_m_s": 0.0})
     start = _stirred(neutral_state(robot, 50.0), 1)
     before = _angular_momentum(start, robot)
-    with Simulation(robot) as simulation:
-        end = _run(simulation, start, _commands(10))[-1]
+    with PyBulletEngine(robot) as engine:
+        end = _run(engine, start, _commands(10))[-1]
     assert np.linalg.norm(_angular_momentum(end, robot) - before) < 0.02 * np.linalg.norm(before)
 
 
-def test_a_standing_robot_at_rest_stays_at_rest(flat: Simulation) -> None:
+def test_a_standing_robot_at_rest_stays_at_rest(flat: PyBulletEngine) -> None:
     hold = np.full((120, CABLES_N), nominal_rest_length(ROBOT))
     settled = _run(flat, _on_a_delta(), hold)[-1]
     later = _run(flat, settled, hold[:30])
@@ -232,12 +178,12 @@ def test_a_standing_robot_at_rest_stays_at_rest(flat: Simulation) -> None:
     assert settled.com[2] == pytest.approx(0.84 + ROBOT.bar_radius_m, abs=0.07)
 
 
-def test_a_flat_mesh_carries_like_the_plane(flat: Simulation) -> None:
+def test_a_flat_mesh_carries_like_the_plane(flat: PyBulletEngine) -> None:
     hold = np.full((120, CABLES_N), nominal_rest_length(ROBOT))
     on_plane = _run(flat, _on_a_delta(), hold)[-1]
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(generate(0, 0.0))
-        on_mesh = _run(simulation, _on_a_delta(), hold)[-1]
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(generate(0, 0.0))
+        on_mesh = _run(engine, _on_a_delta(), hold)[-1]
     np.testing.assert_allclose(on_mesh.nodes(), on_plane.nodes(), atol=0.01)
 
 
@@ -247,18 +193,18 @@ def test_no_bar_sinks_into_or_passes_through_the_roughest_ground() -> None:
     robot = ROBOT.model_copy(update={"winch_speed_m_per_s": 0.7})
     shares = np.linspace(0.0, 1.0, 21)[:, None, None]
     lowest = []
-    with Simulation(robot) as simulation:
+    with PyBulletEngine(robot) as engine:
         for seed in range(40):
             ground = generate(seed, 1.0)
-            simulation.set_ground(ground)
-            states = _run(simulation, neutral_state(robot, 1.9), _commands(100, seed))
+            engine.set_ground(ground)
+            states = _run(engine, neutral_state(robot, 1.9), _commands(100, seed))
             nodes = np.array([state.nodes() for state in states])
             axes = shares * nodes[:, None, 0::2] + (1 - shares) * nodes[:, None, 1::2]
             lowest.append((axes[..., 2] - ground.height(axes[..., 0], axes[..., 1])).min())
     assert min(lowest) > 0.8 * robot.bar_radius_m
 
 
-def test_winches_move_at_their_speed_and_stop_at_the_clipped_command(flat: Simulation) -> None:
+def test_winches_move_at_their_speed_and_stop_at_the_clipped_command(flat: PyBulletEngine) -> None:
     flat.reset(neutral_state(ROBOT, 50.0))
     command = np.full(CABLES_N, 9.0)
     nominal, reach = nominal_rest_length(ROBOT), ROBOT.winch_speed_m_per_s * CONTROL_STEP_S
@@ -271,16 +217,16 @@ def test_winches_move_at_their_speed_and_stop_at_the_clipped_command(flat: Simul
 def test_the_usual_physics_step_is_close_to_a_fine_one() -> None:
     ends = []
     for step_s in (ROBOT.physics_step_s, 0.0005):
-        with Simulation(ROBOT.model_copy(update={"physics_step_s": step_s})) as simulation:
-            ends.append(_run(simulation, _on_a_delta(), _commands(10))[-1].com)
+        with PyBulletEngine(ROBOT.model_copy(update={"physics_step_s": step_s})) as engine:
+            ends.append(_run(engine, _on_a_delta(), _commands(10))[-1].com)
     assert np.linalg.norm(ends[0] - ends[1]) < 0.03
 
 
 # Repeatability
 
 
-def _digest(ground: Terrain | None, simulation: Simulation) -> str:
-    states = _run(simulation, _start(ground), _commands(30, 7))
+def _digest(ground: Terrain | None, engine: PyBulletEngine) -> str:
+    states = _run(engine, _start(ground), _commands(30, 7))
     return hashlib.sha256(np.array([_numbers(state) for state in states]).tobytes()).hexdigest()
 
 
@@ -292,34 +238,34 @@ def test_an_episode_repeats_to_the_last_bit_in_a_fresh_process_and_a_used_client
         text=True,
         check=True,
     )
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(generate(8, 0.5))
-        _run(simulation, _start(ROUGH), _commands(20, 1))
-        simulation.set_ground(ground)
-        _run(simulation, _start(ground), _commands(20, 2))
-        used = _digest(ground, simulation)
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(generate(8, 0.5))
+        _run(engine, _start(ROUGH), _commands(20, 1))
+        engine.set_ground(ground)
+        _run(engine, _start(ground), _commands(20, 2))
+        used = _digest(ground, engine)
     assert fresh.stdout.split()[-1] == used
 
 
 @pytest.mark.parametrize("ground", [None, ROUGH], ids=["flat", "rough"])
 def test_a_reset_forgets_the_contacts_of_the_past(ground: Terrain | None) -> None:
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(ground)
-        lying = _run(simulation, _start(ground), _commands(20, 2))[-1]
-        first = _run(simulation, lying, _commands(5, 3))[-1]
-        _run(simulation, lying, _commands(1, 4))
-        again = _run(simulation, lying, _commands(5, 3))[-1]
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(ground)
+        lying = _run(engine, _start(ground), _commands(20, 2))[-1]
+        first = _run(engine, lying, _commands(5, 3))[-1]
+        _run(engine, lying, _commands(1, 4))
+        again = _run(engine, lying, _commands(5, 3))[-1]
     np.testing.assert_array_equal(_numbers(first), _numbers(again))
 
 
 def test_changing_the_ground_does_not_gather_memory() -> None:
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(ROUGH)
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(ROUGH)
         tracemalloc.start()
         try:
             before, _ = tracemalloc.get_traced_memory()
             for seed in range(5):
-                simulation.set_ground(generate(seed, 1.0))
+                engine.set_ground(generate(seed, 1.0))
             after, _ = tracemalloc.get_traced_memory()
         finally:
             tracemalloc.stop()
@@ -331,43 +277,41 @@ def test_changing_the_ground_does_not_gather_memory() -> None:
 
 def test_a_physics_step_that_does_not_divide_the_control_step_is_refused() -> None:
     with pytest.raises(PhysicsError, match=r"must divide the control step.*choose"):
-        Simulation(ROBOT.model_copy(update={"physics_step_s": 0.003}))
+        PyBulletEngine(ROBOT.model_copy(update={"physics_step_s": 0.003}))
 
 
 def test_an_unknown_stepper_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("T6GPS_PHYSICS", "magic")
-    with pytest.raises(PhysicsError, match="one of plugin, reference, got 'magic'"):
-        Simulation(ROBOT)
+    with pytest.raises(PhysicsError, match="one of plugin, reference, bullet, got 'magic'"):
+        PyBulletEngine(ROBOT)
 
 
-def test_a_missing_plugin_is_named_with_its_remedy(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(plugin, "EXTENSION_SUFFIXES", [".absent.so"])
-    with pytest.raises(PhysicsError, match=r"_stepper\.absent\.so is not built.*T6GPS_PHYSICS=reference"):
-        Simulation(ROBOT, "plugin")
+def test_a_missing_plugin_is_named_with_its_remedy(tmp_path: Path) -> None:
+    with pytest.raises(PhysicsError, match=r"_stepper\..*so is not built.*T6GPS_PHYSICS=reference"):
+        plugin.library_path(tmp_path)
 
 
-def test_a_library_without_bullets_functions_is_refused_with_their_name(monkeypatch: pytest.MonkeyPatch) -> None:
-    simulation.take_over()  # before the library changes its name
-    monkeypatch.setattr(pybullet, "__file__", str(plugin.library_path()))
-    with pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand"):
-        Simulation(ROBOT, "plugin")
+def test_a_library_without_bullets_functions_is_refused_with_their_name() -> None:
+    refusal = pytest.raises(PhysicsError, match="lacks the function b3InitStepSimulationCommand")
+    with PyBulletEngine(ROBOT, "reference") as engine, refusal:
+        plugin.PluginStepper(engine.client, ROBOT, 25, bullet_library=str(plugin.library_path()))
 
 
 @pytest.mark.parametrize("command", [np.full(CABLES_N, np.nan), np.ones(23)], ids=["not finite", "wrong length"])
-def test_a_malformed_command_is_refused(flat: Simulation, command: Array) -> None:
+def test_a_malformed_command_is_refused(flat: PyBulletEngine, command: Array) -> None:
     with pytest.raises(PhysicsError, match="24 finite rest lengths"):
         flat.control_step(command)
 
 
 def test_a_robot_below_the_ground_is_refused() -> None:
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(ROUGH)
-        simulation.reset(neutral_state(ROBOT, -10.0))
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(ROUGH)
+        engine.reset(neutral_state(ROBOT, -10.0))
         with pytest.raises(PhysicsError, match="below the ground"):
-            simulation.control_step(np.full(CABLES_N, 1.0))
+            engine.control_step(np.full(CABLES_N, 1.0))
 
 
-def test_an_unstable_simulation_is_refused(flat: Simulation) -> None:
+def test_an_unstable_simulation_is_refused(flat: PyBulletEngine) -> None:
     start = neutral_state(ROBOT, 50.0)
     flat.reset(start.but(bar_velocities=start.bar_velocities + 80.0))
     with pytest.raises(PhysicsError, match="became unstable"):
@@ -375,16 +319,16 @@ def test_an_unstable_simulation_is_refused(flat: Simulation) -> None:
 
 
 def test_a_robot_beyond_the_side_of_the_ground_is_refused() -> None:
-    with Simulation(ROBOT) as simulation:
-        simulation.set_ground(generate(0, 0.5, 10.0))
+    with PyBulletEngine(ROBOT) as engine:
+        engine.set_ground(generate(0, 0.5, 10.0))
         start = neutral_state(ROBOT, 1.6)
-        simulation.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
+        engine.reset(start.but(bar_positions=start.bar_positions + [4.8, 0.0, 0.0]))
         with pytest.raises(PhysicsError, match="beyond the ground's side at 5"):
-            simulation.control_step(np.full(CABLES_N, 1.0))
+            engine.control_step(np.full(CABLES_N, 1.0))
 
 
 if __name__ == "__main__":
     chosen = {"flat": None, "rough": ROUGH}[sys.argv[1]]
-    with Simulation(ROBOT) as fresh_simulation:
-        fresh_simulation.set_ground(chosen)
-        print(_digest(chosen, fresh_simulation))
+    with PyBulletEngine(ROBOT) as fresh_engine:
+        fresh_engine.set_ground(chosen)
+        print(_digest(chosen, fresh_engine))
