@@ -10,7 +10,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test view check bench soak clean
+.PHONY: install train test view check bench bench-libraries soak clean
 
 install: $(STAMP)
 
@@ -38,6 +38,10 @@ check: install view
 
 bench: install
 	$(BIN)/t6gps bench physics
+
+# The service beside Gymnasium's AsyncVectorEnv and RLlib, in the same rounds; ten minutes, JSON on stdout.
+bench-libraries: install
+	@$(BIN)/python tests/libraries/compare.py
 
 # Twenty kills, a learner that pauses for a minute, and half an hour of workers killed, stopped and scaled at random;
 # the figures are printed at the end.
