@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 from typing import Any
@@ -161,7 +161,7 @@ def _columns() -> tuple[ProgressColumn, ...]:
     return TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
 
 
-def print_rows(title: str, rows: Sequence[dict[str, Any]], columns: dict[str, tuple[str, str]]) -> None:
+def print_rows(title: str, rows: Sequence[Mapping[str, object]], columns: Mapping[str, tuple[str, str]]) -> None:
     """Print chosen columns of rows; a missing value is shown as '-'."""
     table = Table(title=title, title_justify="left")
     for heading, _ in columns.values():
@@ -208,7 +208,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return distinct
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """JSON has no numbers beside the finite ones: the others become null."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}
