@@ -97,12 +97,12 @@ def _efficiency(sizes: Sizes, say: Say) -> dict[str, float | None]:
     tallies = rounds.take_turns(contenders, sizes.rounds, say)
     result: dict[str, float | None] = {}
     for contender in contenders:
-        own, plain = tallies[contender.name], tallies[f"raw_{contender.job.workers}"]
-        if own is plain:
-            result[f"{contender.name}_steps_per_s"] = rounds.steps_per_s(own)
+        measured, plain = tallies[contender.name], tallies[f"raw_{contender.job.workers}"]
+        if measured is plain:
+            result[f"{contender.name}_steps_per_s"] = rounds.steps_per_s(measured)
         else:
-            result[contender.name] = rounds.efficiency(own, plain)
-            result[f"cpu_{contender.name}"] = rounds.cpu_efficiency(own, plain)
+            result[contender.name] = rounds.efficiency(measured, plain)
+            result[f"cpu_{contender.name}"] = rounds.cpu_efficiency(measured, plain)
     served = tallies["efficiency_2"]
     for role in served[0].spent_s:
         seconds = [1e3 * tally.spent_s[role] / tally.steps_n for tally in served]

@@ -38,9 +38,8 @@ class Measurement:
 
     def to_json(self) -> str:
         """One object: the entries of the provenance beside the others."""
-        origin = asdict(self.provenance)
-        own = {"threads": self.threads, "notes": self.notes, "results": self.results}
-        return json.dumps({"bench": self.bench, **origin, **own})
+        entries = {name: value for name, value in asdict(self).items() if name != "provenance"}
+        return json.dumps({**asdict(self.provenance), **entries})
 
 
 def measure(name: str, say: Say, **sizes: float) -> Measurement:

@@ -36,7 +36,7 @@ def measure(seconds: float, rounds_n: int, say: Say) -> dict[str, float]:
     ]
     tallies = rounds.take_turns(contenders, rounds_n, say)
     plain = tallies.pop("raw_2")
-    ratios = {name: rounds.efficiency(own, plain) for name, own in tallies.items()}
+    ratios = {name: rounds.efficiency(measured, plain) for name, measured in tallies.items()}
     return {"raw_2_steps_per_s": rounds.steps_per_s(plain), **ratios}
 
 
