@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import time
 from pathlib import Path
@@ -11,10 +12,12 @@ import pytest
 from t6gps.service.bench import pool, registry, rounds
 from t6gps.service.bench.contenders import Job, rough_job
 from t6gps.service.bench.pool import Sizes
+from t6gps.service.bench.registry import Measurement
 from t6gps.service.bench.role_clock import ROLES, RoleClock
 from t6gps.service.bench.rounds import Contender
 from t6gps.service.bench.tally import Tally, machine_s
 from t6gps.service.pool import deadlines
+from t6gps.service.provenance import provenance
 from t6gps.storage.errors import ConfigError
 
 EFFICIENCIES = ["efficiency_1", "efficiency_2", "efficiency_2_pipes"]
@@ -29,9 +32,9 @@ def ignored(_: str) -> None:
 def test_every_figure_is_there_and_positive(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr(deadlines, "SHORTEST_S", 2.0)
     sizes = Sizes(seconds=1.0, rounds=1, versions_n=1, kills_n=1, hangs_n=1, pools=(4, 8), large_pool_s=1.0)
-    said: list[str] = []
-    results = pool.measure(sizes, said.append)
-    assert len(said) == 5 and said[0].startswith("round 1 of 1: raw_1 ")
+    lines: list[str] = []
+    results = pool.measure(sizes, lines.append)
+    assert len(lines) == 5 and lines[0].startswith("round 1 of 1: raw_1 ")
     expected = ["raw_1_steps_per_s", "raw_2_steps_per_s", *EFFICIENCIES, *LATENCIES]
     expected += [f"cpu_{efficiency}" for efficiency in EFFICIENCIES]
     expected += [f"cpu_s_per_1000_steps_{role}" for role in ROLES]
@@ -122,6 +125,14 @@ def test_a_cluster_is_refused(monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "127.0.0.1:6379")
     with pytest.raises(ConfigError, match="unset it"):
         registry.measure("pool", ignored)
+
+
+def test_a_measurement_says_where_it_comes_from() -> None:
+    measured = Measurement("pool", provenance(), 1, ("a note",), {"speed": 1.5, "nothing": None})
+    record = json.loads(measured.to_json())
+    assert record["commit"] == measured.provenance.commit
+    assert record["results"] == {"speed": 1.5, "nothing": None}
+    assert set(record) == {"bench", "commit", "date", "platform", "cores", "versions", "threads", "notes", "results"}
 
 
 def test_other_benchmarks_have_no_sizes() -> None:
