@@ -41,7 +41,7 @@ class Sizes:
 
     @classmethod
     def within(cls, seconds: float, rounds: int) -> Sizes:
-        """Sizes of turns so long and so many; with less time than the default, fewer faults and smaller pools."""
+        """Sizes for such turns: less time than the default means fewer faults and smaller pools."""
         whole = cls()
         share = min(1.0, seconds * rounds / (whole.seconds * whole.rounds))
         versions_n, kills_n, hangs_n, *pools = (
@@ -51,7 +51,7 @@ class Sizes:
 
 
 def pool(say: Say, seconds: float = SECONDS, rounds: int = ROUNDS) -> dict[str, float | None]:
-    """Everything that `t6gps bench pool` reports, within turns so long and so many (`measure`).
+    """Everything that `t6gps bench pool` reports, from turns of such length and number (`measure`).
 
     ConfigError when the numbers make no measurement, or when RAY_ADDRESS names a cluster.
     """

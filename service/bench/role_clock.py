@@ -12,10 +12,10 @@ from t6gps.service.ray_backend import processes
 TITLES = {
     "ray::WorkerActor": "worker",
     "ray::LearnerActor": "learner",
-    "ray::HolderActor": "holder",
+    "ray::HolderActor": "policy_server",
 }
 """How the command lines of actors begin; every other process below this one is Ray's own."""
-ROLES = ("worker", "supervisor", "committer", "learner", "holder", "ray")
+ROLES = ("worker", "supervisor", "committer", "learner", "policy_server", "ray")
 
 
 class RoleClock:

@@ -14,7 +14,7 @@ from t6gps.service.bench.contenders import Job
 from t6gps.service.bench.tally import Tally
 
 Say = Callable[[str], None]
-"""What is told how far a benchmark is, in a line."""
+"""Takes a line that says how far a benchmark is."""
 
 
 @dataclass(frozen=True)

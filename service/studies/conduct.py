@@ -123,13 +123,7 @@ def conduct(
     by default the one that is checked out.
     """
     present = present or commit()
-    there = {run.name: run for run in catalog.list_runs(root)}
-    runs = {trial.name: there[trial.name] for trial in planned if trial.name in there}
-    for trial in planned:
-        if trial.name in runs:
-            session.check_unchanged(
-                runs[trial.name], trial.config, "give another --root, or the settings that the study was begun with"
-            )
+    runs = _begun(planned, root)
     _warn_of_other_commits(list(runs.values()), present, watcher)
     missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]
     unseen = [
@@ -158,6 +152,18 @@ def conduct(
         evaluation.keep(run, _evaluated(trial, run, conditions[condition], serial, watcher), condition)
         pace.done(_condition_s(trial))
     return [_finished(root, trial, conditions) for trial in planned]
+
+
+def _begun(planned: Sequence[Trial], root: Path) -> dict[str, Run]:
+    """The trials' runs that are there, by name. RunError if one has another configuration than its trial."""
+    there = {run.name: run for run in catalog.list_runs(root)}
+    runs = {trial.name: there[trial.name] for trial in planned if trial.name in there}
+    for trial in planned:
+        if trial.name in runs:
+            session.check_unchanged(
+                runs[trial.name], trial.config, "give another --root, or the settings that the study was begun with"
+            )
+    return runs
 
 
 def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:

@@ -9,7 +9,7 @@ from typing import Protocol
 from t6gps.service.training.loop import Observer
 
 Progress = Callable[[int, int], None]
-"""Is told how much is done and how much there is in all."""
+"""Takes how much is done, and how much there is in all."""
 
 
 class Watcher(Protocol):
@@ -22,7 +22,7 @@ class Watcher(Protocol):
         """What may spoil the comparison."""
 
     def run(self, iterations: int) -> AbstractContextManager[Observer]:
-        """The observer of a run of so many iterations that is trained or evaluated meanwhile."""
+        """The observer of a run with that number of iterations, while it is trained or evaluated."""
 
     def task(self, title: str) -> AbstractContextManager[Progress]:
-        """What is told the progress of work that has no phases."""
+        """Takes the progress of work that has no phases."""

@@ -25,7 +25,7 @@ WORKERS_N = 2
 
 
 def measure(seconds: float, rounds_n: int, say: Say) -> dict[str, float]:
-    """The figures by name, from turns so long and so many."""
+    """The figures by name, from turns of such length and number."""
     pool.check_local()
     job = rough_job(WORKERS_N, seconds)
     contenders = [
