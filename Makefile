@@ -10,7 +10,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test check bench soak clean
+.PHONY: install train test view check bench bench-libraries soak clean
 
 install: $(STAMP)
 
@@ -25,16 +25,23 @@ train: install
 test: install
 	$(BIN)/pytest
 
-check: install
+# The tree as `t6gps/...`, in links, for tools that do not know how the rooms are mapped into the package.
+view:
+	@mkdir -p build/typing/t6gps && for room in $(ROOMS) deploy; do ln -sfn ../../../$$room build/typing/t6gps/$$room; done
+
+check: install view
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
 	$(BIN)/lint-imports
-	@mkdir -p build/typing/t6gps && for room in $(ROOMS) deploy; do ln -sfn ../../../$$room build/typing/t6gps/$$room; done
 	cd build/typing && MYPYPATH=. ../../$(BIN)/mypy --config-file ../../pyproject.toml --namespace-packages \
 		--explicit-package-bases $(ROOMS:%=t6gps/%)
 
 bench: install
 	$(BIN)/t6gps bench physics
+
+# The service beside Gymnasium's AsyncVectorEnv and RLlib, in the same rounds; ten minutes, JSON on stdout.
+bench-libraries: install
+	@$(BIN)/python tests/libraries/compare.py
 
 # Twenty kills, a learner that pauses for a minute, and half an hour of workers killed, stopped and scaled at random;
 # the figures are printed at the end.

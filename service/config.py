@@ -2,20 +2,24 @@
 
 from __future__ import annotations
 
+import copy
 import difflib
 import json
 import tomllib
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from importlib import resources
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from pydantic import BaseModel, Field, ValidationError, model_validator
+from pydantic import BaseModel, Field, JsonValue, ValidationError, model_validator
 
 from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
+
+if TYPE_CHECKING:
+    from pydantic_core import ErrorDetails
 
 WORKERS_MOST_N = 10000
 
@@ -138,8 +142,8 @@ def differences(stored: Config, wanted: Config) -> list[str]:
     return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in SPEED_ONLY]
 
 
-def _overridden(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, Any]:
-    values = json.loads(json.dumps(values))
+def _overridden(values: dict[str, JsonValue], overrides: Sequence[str]) -> dict[str, JsonValue]:
+    values = copy.deepcopy(values)
     for override in overrides:
         key, equals, text = override.partition("=")
         if not equals or not key.strip():
@@ -151,14 +155,15 @@ def _overridden(values: dict[str, Any], overrides: Sequence[str]) -> dict[str, A
         *sections, name = key.strip().split(".")
         table = values
         for section in sections:
-            table = table.setdefault(section, {})
-            if not isinstance(table, dict):
+            inner = table.setdefault(section, {})
+            if not isinstance(inner, dict):
                 raise ConfigError(f"--set {key}: {section} is not a section; allowed: {', '.join(_known_keys())}")
+            table = inner
         table[name] = value
     return values
 
 
-def _validated(values: dict[str, Any], where: str) -> Config:
+def _validated(values: dict[str, JsonValue], where: str) -> Config:
     try:
         text = json.dumps(values)
     except TypeError as error:
@@ -166,16 +171,16 @@ def _validated(values: dict[str, Any], where: str) -> Config:
     try:
         return Config.model_validate_json(text)
     except ValidationError as error:
-        raise ConfigError(f"{where}: " + "; ".join(_sentence(dict(item)) for item in error.errors())) from None
+        raise ConfigError(f"{where}: " + "; ".join(_sentence(item) for item in error.errors())) from None
 
 
-def _sentence(item: dict[str, Any]) -> str:
+def _sentence(item: ErrorDetails) -> str:
     key = ".".join(str(part) for part in item["loc"])
     if item["type"] == "extra_forbidden":
         return f"unknown key {key}{_nearest(key, _known_keys())}; allowed: {', '.join(_siblings(key))}"
-    found = "" if isinstance(item["input"], dict) else f", found {item['input']!r}"
+    value = "" if isinstance(item["input"], dict) else f", found {item['input']!r}"
     message = item["msg"].removeprefix("Value error, ").replace("Input should be", "must be")
-    return f"{key} {message}{found}".strip()
+    return f"{key} {message}{value}".strip()
 
 
 def _siblings(key: str) -> list[str]:
@@ -198,8 +203,8 @@ def _nearest(name: str, names: Sequence[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def _flat(values: dict[str, Any], prefix: str = "") -> dict[str, Any]:
-    flat: dict[str, Any] = {}
+def _flat(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
+    flat: dict[str, object] = {}
     for key, value in values.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return flat

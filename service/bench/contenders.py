@@ -1,6 +1,6 @@
 """The same episodes in several ways: a plain loop, the service, and processes joined by pipes.
 
-Each takes a job and gives a tally. `pool_peers` has the libraries.
+Each takes a job and gives a tally.
 
     raw       every process runs the next episode of the plan and forgets it: no Ray, nothing sent, nothing kept
     service   what `t6gps train` does while it samples: pool, ledger, spool forced to disk, learner at work on what came
@@ -13,18 +13,23 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import closing, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 from multiprocessing.connection import Connection, wait
+from multiprocessing.sharedctypes import Synchronized
+from multiprocessing.synchronize import Barrier
 from pathlib import Path
 from typing import Any
 
+from t6gps.service import config as configuration
+from t6gps.service import seeding
 from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import NotingWorker, Tally, steps_of
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
+from t6gps.service.execution.wiring import new_learner
 from t6gps.service.pool import control
 from t6gps.service.pool.attempt import Failure, attempt
 from t6gps.service.pool.state import RunState
@@ -35,6 +40,9 @@ from t6gps.storage.spool import Spool
 from t6gps.workers.settings import RolloutSettings
 
 START_DEADLINE_S = 180.0
+PRESET = "rough"
+MOST_EPISODES_PER_S = 20
+"""More than a process simulates of the preset's episodes."""
 
 
 class Enough(Exception):
@@ -61,6 +69,13 @@ class Job:
         return self.config.run.steps
 
 
+def rough_job(workers: int, seconds: float) -> Job:
+    """Episodes of PRESET with the untrained policy, more than any contender runs in that time."""
+    episodes = round(MOST_EPISODES_PER_S * workers * (seconds + 10))
+    config = configuration.load(PRESET, [f"run.workers={workers}", f"run.episodes={episodes}"])
+    return Job(config, seeding.training_plans(config, 0), new_learner(config).policy(), seconds)
+
+
 def raw(job: Job) -> Tally:
     """A plain loop in each of N processes, which share nothing but the number of the next plan."""
     context = multiprocessing.get_context("spawn")
@@ -77,7 +92,7 @@ def raw(job: Job) -> Tally:
     return merged
 
 
-def _loop(connection: Connection, job: Job, notes: Path, number: Any, barrier: Any) -> None:
+def _loop(connection: Connection, job: Job, notes: Path, number: Synchronized[int], barrier: Barrier) -> None:
     tally = Tally(job.seconds)
     with closing(NotingWorker(job.config.rollout, notes)) as worker:
         barrier.wait(START_DEADLINE_S)
@@ -105,7 +120,7 @@ def pipes(job: Job) -> Tally:
             connection.send(next(plans))
         while not tally.is_over:
             ready = wait(connections)
-            for connection in [each for each in connections if each in ready]:
+            for connection in [connection for connection in connections if connection in ready]:
                 episode = _received(connection)
                 connection.send(next(plans))
                 if not isinstance(episode, Failure):
@@ -123,24 +138,24 @@ def _serve(connection: Connection, settings: RolloutSettings, snapshot: PolicySn
 
 
 @contextmanager
-def _processes(n: int, target: Any, *arguments: Any) -> Iterator[list[Connection]]:
+def _processes(n: int, target: Callable[..., None], *arguments: object) -> Iterator[list[Connection]]:
     """N fresh processes, each called with its end of a pipe and the arguments; they are killed at the end."""
     context = multiprocessing.get_context("spawn")
     pairs = [context.Pipe() for _ in range(n)]
     started = []
     try:
-        for _, theirs in pairs:
-            process = context.Process(target=target, args=(theirs, *arguments), daemon=True)
+        for _, remote_end in pairs:
+            process = context.Process(target=target, args=(remote_end, *arguments), daemon=True)
             process.start()
             started.append(process)
-            theirs.close()
-        yield [ours for ours, _ in pairs]
+            remote_end.close()
+        yield [local_end for local_end, _ in pairs]
     finally:
         for process in started:
             process.kill()
             process.join()
-        for ours, _ in pairs:
-            ours.close()
+        for local_end, _ in pairs:
+            local_end.close()
 
 
 def _received(connection: Connection) -> Any:
@@ -150,8 +165,8 @@ def _received(connection: Connection) -> Any:
         raise RunError("a process of the benchmark died; see its message above, and try again") from None
 
 
-def service(job: Job) -> tuple[Tally, dict[str, float]]:
-    """The tally of committed steps, and the processor time of each role meanwhile (s)."""
+def service(job: Job) -> Tally:
+    """The tally of committed steps, with the processor time of each role meanwhile."""
     tally, clock = Tally(job.seconds), RoleClock()
     with (
         tempfile.TemporaryDirectory() as notes,
@@ -169,9 +184,9 @@ def service(job: Job) -> tuple[Tally, dict[str, float]]:
 
         with suppress(Enough):
             executor.sample(job.plans, job.snapshot, keep)
-        spent_s = clock.spent_s()
+        tally.spent_s = clock.spent_s()
         tally.read(Path(notes).iterdir())
-    return tally, spent_s
+    return tally
 
 
 @contextmanager

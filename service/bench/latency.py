@@ -66,7 +66,7 @@ def weight_latencies(job: Job, versions_n: int) -> list[float]:
 def recoveries(job: Job, faults: dict[signal.Signals, int]) -> dict[signal.Signals, list[float]]:
     """Seconds from a signal to a worker in mid-episode to the first accepted episode of its successor, by signal.
 
-    Each signal is sent so often, to a worker drawn at random, a few episodes after the last recovery.
+    Each signal is sent as often as `faults` says, to a worker drawn at random, a few episodes after the last recovery.
     """
     rng = np.random.default_rng(0)
     due = [number for number, times in faults.items() for _ in range(times)]

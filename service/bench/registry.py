@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import difflib
 import importlib
-import subprocess
+import json
 from collections.abc import Callable
-from importlib import metadata
-from pathlib import Path
-from typing import Any
+from dataclasses import asdict, dataclass
+from functools import partial
 
+from t6gps.service.bench.rounds import Say
+from t6gps.service.provenance import Provenance, provenance
 from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
@@ -22,11 +23,27 @@ BENCHMARKS = {
 
 
 SIZED = ("pool",)
-"""Benchmarks that can be told how long and how often to measure."""
+"""Benchmarks that can be told how long and how often to measure, and that say how far they are."""
 
 
-def measure(name: str, **sizes: float) -> dict[str, Any]:
-    """Run a benchmark: {"bench", "commit", "threads", "notes", "results": {key: number, None where nothing is}}.
+@dataclass(frozen=True)
+class Measurement:
+    """A benchmark's figures and where they come from; `results` are None where there is nothing to measure."""
+
+    bench: str
+    provenance: Provenance
+    threads: int
+    notes: tuple[str, ...]
+    results: dict[str, float | None]
+
+    def to_json(self) -> str:
+        """One object: the entries of the provenance beside the others."""
+        entries = {name: value for name, value in asdict(self).items() if name != "provenance"}
+        return json.dumps({**asdict(self.provenance), **entries})
+
+
+def measure(name: str, say: Say, **sizes: float) -> Measurement:
+    """Run a benchmark, which says how far it is.
 
     ConfigError for an unknown name, or for sizes of a benchmark that has none.
     """
@@ -38,17 +55,7 @@ def measure(name: str, **sizes: float) -> dict[str, Any]:
         raise ConfigError(f"bench {name} has no --{' and no --'.join(sizes)}; allowed for: {', '.join(SIZED)}")
     module = importlib.import_module(BENCHMARKS[name])
     run: Callable[..., dict[str, float | None]] = getattr(module, name)
-    known = {"threads": getattr(module, "THREADS", 1), "notes": list(getattr(module, "NOTES", ()))}
-    return {"bench": name, "commit": commit(), **known, "results": run(**sizes)}
-
-
-def commit() -> str:
-    """The checked-out commit, or the version of an installed package."""
-    folder = Path(__file__).parent
-    git = subprocess.run(
-        ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return git.stdout.strip() if git.returncode == 0 else metadata.version("t6gps")
+    if name in SIZED:
+        run = partial(run, say)
+    threads, notes = getattr(module, "THREADS", 1), tuple(getattr(module, "NOTES", ()))
+    return Measurement(name, provenance(), threads, notes, run(**sizes))

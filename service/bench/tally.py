@@ -9,6 +9,7 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Iterable
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
@@ -16,29 +17,33 @@ from t6gps.workers.settings import RolloutSettings
 from t6gps.workers.worker import RolloutWorker
 
 
+@dataclass
 class Tally:
     """Control steps that were done, and when (s, the clock of `time.monotonic`, which all processes share).
 
-    simulating    share of the machine's processor time that went into simulation meanwhile
+    seconds       how long is counted
+    machine_s     `machine_s` at the first entry and at the last
+    simulating    share of the machine's processor time that went into simulation meanwhile; 0 where nobody notes it
+    spent_s       processor time of each role meanwhile (s), where there are roles
     """
 
-    def __init__(self, seconds: float) -> None:
-        self._seconds = seconds
-        self.done: list[tuple[float, int]] = []
-        self.simulating = 0.0
-        self._machine_s: list[float] = []
+    seconds: float
+    done: list[tuple[float, int]] = field(default_factory=list)
+    machine_s: list[float] = field(default_factory=list)
+    simulating: float = 0.0
+    spent_s: dict[str, float] = field(default_factory=dict)
 
     def add(self, steps: int) -> bool:
-        """So many steps are done now; True when the time is up."""
+        """Count steps that are done now; True when the time is up."""
         self.done.append((time.monotonic(), steps))
         if len(self.done) == 1 or self.is_over:
-            self._machine_s.append(machine_s())
+            self.machine_s.append(machine_s())
         return self.is_over
 
     @property
     def is_over(self) -> bool:
         """True when `seconds` have passed since the first entry, and one came after it."""
-        return len(self.done) > 1 and self.took_s >= self._seconds
+        return len(self.done) > 1 and self.took_s >= self.seconds
 
     @property
     def took_s(self) -> float:
@@ -59,7 +64,7 @@ class Tally:
         """Set `simulating` from what the processes that simulate have noted meanwhile."""
         begin_s, end_s = self.done[0][0], self.done[-1][0]
         rates = [_simulated_per_s(path, begin_s, end_s) for path in notes]
-        self.simulating = sum(rates) * self.took_s / (self._machine_s[-1] - self._machine_s[0])
+        self.simulating = sum(rates) * self.took_s / (self.machine_s[-1] - self.machine_s[0])
 
 
 class NotingWorker(RolloutWorker):

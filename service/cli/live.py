@@ -1,25 +1,20 @@
-"""The commands of someone who looks after a run that goes on: `scale`, `status`, `replay`."""
+"""The commands for a run that is running, and for what it had to set aside: `scale`, `status`, `replay`."""
 
 from __future__ import annotations
 
 import json
 from dataclasses import asdict
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import typer
 
+from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
 from t6gps.service.pool import control, crash_bundle
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.views import terminal
-from t6gps.service.views.terminal import console
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
-
-Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
-RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
-Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
-DEFAULT_ROOT = Path("runs")
 
 WORKER_COLUMNS = {
     "slot": ("slot", "{:d}"),
@@ -47,63 +42,59 @@ def scale(
         control.SCALE_DEADLINE_S
     ),
 ) -> None:
-    """Grow or shrink a run while it goes on; its data stay the same."""
+    """Grow or shrink a running run; its data stay the same."""
     reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
 def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    found = control.status(catalog.open_run(root, run_name))
+    state = control.status(catalog.open_run(root, run_name))
     if as_json:
-        typer.echo(json.dumps(found))
+        typer.echo(json.dumps(state))
         return
-    counts = {**found["episodes"], **found["processes"]}
-    waits = [f"{wait['what']} since {wait['for_s']:.1f} s" for wait in found["waits"]]
+    counts = {**state["episodes"], **state["processes"]}
+    waits = [f"{wait['what']} since {wait['for_s']:.1f} s" for wait in state["waits"]]
     lines = [
-        f"run {run_name}: {found['state']}" + (f", {found['reason']}" if found["reason"] else ""),
-        f"{found['phase']}: {found['backlog']} episodes to go, {found['leases']} leased, "
-        f"{found['bytes_in_flight'] / 1e6:.1f} MB in flight; {found['ready']} of {found['wanted']} workers ready",
+        f"run {run_name}: {state['state']}" + (f", {state['reason']}" if state["reason"] else ""),
+        f"{state['phase']}: {state['backlog']} episodes to go, {state['leases']} leased, "
+        f"{state['bytes_in_flight'] / 1e6:.1f} MB in flight; {state['ready']} of {state['wanted']} workers ready",
         ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()),
         *waits,
     ]
-    if found["quarantined"]:
-        lines.append(f"left out for their failures: episodes {', '.join(map(str, found['quarantined']))}")
+    if state["quarantined"]:
+        lines.append(f"quarantined for their failures: episodes {', '.join(map(str, state['quarantined']))}")
     typer.echo("\n".join(lines))
-    if found["workers"]:
-        terminal.print_rows("Workers", [dict(worker) for worker in found["workers"]], WORKER_COLUMNS)
+    if state["workers"]:
+        terminal.print_rows("Workers", [dict(worker) for worker in state["workers"]], WORKER_COLUMNS)
 
 
 def replay(
     path: Annotated[Path, typer.Argument(metavar="BUNDLE", help="RUN/bundles/episode-N.json")], as_json: Json = False
 ) -> None:
     """Run an episode that failed once more, alone and in this process, and say what happens."""
-    kept = crash_bundle.read(path)
-    result = crash_bundle.replay(kept)
-    found: dict[str, Any] = {"episode": kept.plan.episode_id, "then": [f["message"] for f in kept.failures]}
+    bundle = crash_bundle.read(path)
+    result = crash_bundle.replay(bundle)
     if isinstance(result, Failure):
-        found |= {"now": "failed", **asdict(result)}
+        now, text = {"now": "failed", **asdict(result)}, f"{result}\n{result.trace}"
     else:
-        summary = result.summary.to_pylist()[0]
-        found |= {"now": "succeeded", **{key: summary[key] for key in ("steps", "ended_by", "cost")}}
+        row = result.summary.to_pylist()[0]
+        now = {"now": "succeeded", **{key: row[key] for key in ("steps", "ended_by", "cost")}}
+        text = f"{row['steps']} steps, {row['ended_by']}, cost {row['cost']:.3f}"
     if as_json:
-        typer.echo(json.dumps(found))
+        then = [failure["message"] for failure in bundle.failures]
+        typer.echo(json.dumps({"episode": bundle.plan.episode_id, "then": then, **now}))
         return
-    for number, failure in enumerate(kept.failures, 1):
+    for number, failure in enumerate(bundle.failures, 1):
         typer.echo(f"then, attempt {number}: {failure['error']}: {failure['message']}")
-    if isinstance(result, Failure):
-        typer.echo(f"now: {result}\n{result.trace}")
-    else:
-        typer.echo(f"now: {found['steps']} steps, {found['ended_by']}, cost {found['cost']:.3f}")
+    typer.echo(f"now: {text}")
 
 
-def say_what_is_left_out(run: Run) -> None:
+def name_quarantined(run: Run) -> None:
     """Name the episodes of a run that are in quarantine, and how to look into them."""
     for purpose in ("episode", "evaluation"):
         for number in sorted(crash_bundle.kept(run.bundles, purpose)):
             path = run.bundles / f"{purpose}-{number}.json"
-            console.print(
-                f"{purpose} {number} failed again and again and is left out; look into it with: t6gps replay {path}",
-                highlight=False,
-                soft_wrap=True,
+            terminal.say(
+                f"{purpose} {number} failed again and again and is quarantined; look into it with: t6gps replay {path}"
             )

@@ -1,7 +1,8 @@
 """The command line `t6gps`. Results go to stdout, progress and messages to stderr; bad input exits with 2.
 
-What is slow to import (ray, torch, matplotlib) is imported by the commands that need it, so that the others answer
-at once.
+This module has the commands that start something: train, study, eval, bench. `stored` has those that read what is
+there, `live` those for a run that is running. What is slow to import (ray, torch, matplotlib) is imported by the
+commands that need it, so that the others answer at once.
 """
 
 from __future__ import annotations
@@ -10,58 +11,39 @@ import json
 import shlex
 import sys
 from contextlib import closing
-from enum import StrEnum
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated, NoReturn
 
-import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import live
-from t6gps.service.cli.live import DEFAULT_ROOT, Json, Root, RunName
+from t6gps.service.cli import live, stored
+from t6gps.service.cli.options import (
+    DEFAULT_ROOT,
+    Autoscale,
+    Json,
+    Overrides,
+    Root,
+    RunName,
+    Serial,
+    Workers,
+    check_keys,
+    with_workers,
+)
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
 from t6gps.service.training import evaluation, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
-from t6gps.service.views.diagnosis import diagnose
-from t6gps.service.views.terminal import console
-from t6gps.storage import catalog, tables
-from t6gps.storage import query as sql_query
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, RunError, T6GpsError
+from t6gps.storage.errors import T6GpsError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
-EXPORT_SECTIONS = ("robot.", "terrain.")
-
-Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
-]
-Serial = Annotated[bool, typer.Option("--serial", help="Run in this process, without Ray; same data.")]
-Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers (changes the speed only).")]
-Autoscale = Annotated[
-    str | None, typer.Option("--autoscale", metavar="MIN:MAX", help="Keep workers between, by backlog and free CPUs.")
-]
-
-
-class ExportFormat(StrEnum):
-    """Formats in which the robot leaves."""
-
-    MJCF = "mjcf"
-
-
-class QueryFormat(StrEnum):
-    """Formats of a query's result."""
-
-    TABLE = "table"
-    CSV = "csv"
-    JSON = "json"
-    ARROW = "arrow"
 
 
 def main() -> None:
@@ -76,7 +58,7 @@ def main() -> None:
         )
     else:
         return
-    console.print(f"error: {message}", style="red", highlight=False, soft_wrap=True, markup=False)
+    terminal.say(f"error: {message}", style="red")
     sys.exit(EXIT_BAD_INPUT)
 
 
@@ -88,30 +70,29 @@ def train(
     workers: Workers = None,
     autoscale: Autoscale = None,
     serial: Serial = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Go on with an interrupted run.")] = False,
+    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
-    config = configuration.load(source, _with_workers(overrides, workers, autoscale))
+    config = configuration.load(source, with_workers(overrides, workers, autoscale))
     name = Path(source).stem if run_name is None else run_name
     if resume:
-        this = catalog.open_run(root, name)
-        session.check_unchanged(this, config, "repeat the run's settings, or start a new run with --run")
+        run = catalog.open_run(root, name)
+        session.check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
     else:
-        this = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
+        run = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
     try:
-        result, pictures = session.complete(config, this, serial)
+        with terminal.ProgressDisplay(config.run.iterations) as display:
+            result = session.complete(config, run, serial, display)
     except KeyboardInterrupt:
-        console.print(
-            f"stopped; everything sampled so far is kept. Go on with: {_again(this, source, root, overrides)}",
-            highlight=False,
-            soft_wrap=True,
-        )
-        raise typer.Exit(EXIT_INTERRUPTED) from None
-    _print_learning(this)
+        _exit_interrupted(_train_command(run, source, root, overrides))
+    from t6gps.service.views import run_figures
+
+    pictures = run_figures.draw(run, config.terrain)
+    stored.print_learning(run)
     terminal.print_evaluation(result)
-    live.say_what_is_left_out(this)
-    _print_paths(this, pictures, root)
+    live.name_quarantined(run)
+    stored.print_paths(run, pictures, root)
 
 
 @app.command()
@@ -128,21 +109,16 @@ def study(
     serial: Serial = False,
     overrides: Overrides = None,
 ) -> None:
-    """Compare settings over seeds; run it again to go on after an interruption."""
+    """Compare settings over seeds; run it again to resume it after an interruption."""
     from t6gps.service.studies import conduct as conducting
 
     chosen = declared.find(name)
-    planned = conducting.trials(name, chosen, scale, seeds, _with_workers(overrides, workers), arms)
+    planned = conducting.trials(name, chosen, scale, seeds, with_workers(overrides, workers), arms)
     command = _study_command(name, scale, seeds, arms, root, out, overrides)
     try:
-        finished = conducting.conduct(planned, root, name, chosen.conditions, serial)
+        finished = conducting.conduct(planned, root, name, chosen.conditions, serial, terminal.StudyDisplay())
     except KeyboardInterrupt:
-        console.print(
-            f"stopped; everything sampled so far is kept. Go on with: {shlex.join(command)}",
-            highlight=False,
-            soft_wrap=True,
-        )
-        raise typer.Exit(EXIT_INTERRUPTED) from None
+        _exit_interrupted(command)
     from t6gps.service.studies import report
 
     files = report.write(out or Path("studies") / f"{name}-{scale}", name, chosen, command, finished)
@@ -164,114 +140,18 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's newest policy without noise on unseen seeds."""
-    this = catalog.open_run(root, run_name)
-    _check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
-    config = configuration.parse(this.config_path.read_text(), _with_workers(overrides, workers))
-    with closing(session.restored(config, this, serial, engine)) as executor:
-        result = session.evaluated(config, executor, episodes, seed, terrain_seed)
+    run = catalog.open_run(root, run_name)
+    check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
+    config = configuration.parse(run.config_path.read_text(), with_workers(overrides, workers))
+    with (
+        closing(session.restored(config, run, serial, engine)) as executor,
+        terminal.ProgressDisplay(config.run.iterations) as display,
+    ):
+        result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
     if as_json:
         typer.echo(json.dumps(result))
     else:
         terminal.print_evaluation(result)
-
-
-@app.command()
-def runs(root: Root = DEFAULT_ROOT) -> None:
-    """List the runs."""
-    if not root.is_dir():
-        raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
-    rows = []
-    for this in catalog.list_runs(root):
-        last = tables.read(this, "iterations").sort_by("iteration").to_pylist()[-1:]
-        done = len(last) and last[0]["iteration"] + 1
-        wanted = configuration.parse(this.config_path.read_text()).run.iterations
-        rows.append(
-            {
-                "run": this.name,
-                "iterations": f"{done} of {wanted}",
-                "cost": last[0]["cost"] if last else None,
-                "forward_speed_m_per_s": last[0]["forward_speed_m_per_s"] if last else None,
-            }
-        )
-    columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
-    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
-    terminal.print_rows(f"Runs in {root}", rows, columns)
-
-
-@app.command()
-def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
-    """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
-    this = catalog.open_run(root, run_name)
-    if not tables.committed_iterations(this):
-        typer.echo(f"run {run_name} has not finished an iteration yet")
-        return
-    _print_learning(this)
-    classes = tables.read(this, "classes").to_pylist()
-    last = max((row["iteration"] for row in classes), default=-1)
-    rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
-    terminal.print_rows(f"Segment classes of iteration {last}", rows, terminal.CLASS_COLUMNS)
-    iterations = tables.read(this, "iterations").to_pylist()
-    typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
-    result = evaluation.kept(this)
-    if result:
-        terminal.print_evaluation(result)
-    _print_paths(this, sorted(this.figures.glob("*.png")), root)
-
-
-@app.command()
-def query(
-    run_name: RunName,
-    sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT over frames, episodes, iterations, classes.")],
-    root: Root = DEFAULT_ROOT,
-    form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
-) -> None:
-    """Query a run's stored trajectories with SQL."""
-    terminal.write_table(sql_query.query(catalog.open_run(root, run_name), sql), form.value)
-
-
-@app.command()
-def render(
-    run_name: RunName,
-    episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
-    out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
-    root: Root = DEFAULT_ROOT,
-    step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
-    strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
-) -> None:
-    """Draw a stored episode from its recorded states: a still, a strip of snapshots, or a film."""
-    from t6gps.workers.ground.ground import ground
-    from t6gps.workers.pictures import render as rendering
-
-    this = catalog.open_run(root, run_name)
-    frames = tables.episode_frames(this, episode)
-    row = tables.read(this, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
-    config = configuration.parse(this.config_path.read_text())
-    terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
-    with terminal.task("rendering") as progress:
-        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress)
-    typer.echo(out)
-
-
-@app.command()
-def export(
-    form: Annotated[ExportFormat, typer.Argument(metavar="mjcf", help="MuJoCo's model format.")],
-    out: Annotated[Path, typer.Argument(metavar="FILE.xml", help="File to write.")],
-    terrain_seed: Annotated[int, typer.Option(min=0, help="Seed of rough ground (--set terrain.difficulty=1).")] = 0,
-    root: Root = DEFAULT_ROOT,
-    overrides: Overrides = None,
-) -> None:
-    """Write the robot and its ground as a model for other tools."""
-    from t6gps.workers.ground.ground import ground
-    from t6gps.workers.physics.mjcf import to_mjcf
-
-    _check_keys(overrides, f"export {form.value}", EXPORT_SECTIONS, "the model has only a robot and its ground")
-    config = configuration.parse("{}", overrides or [], "--set")
-    text = to_mjcf(config.robot, ground(config.terrain, terrain_seed, config.terrain.difficulty))
-    try:
-        out.write_text(text)
-    except OSError as error:
-        raise ConfigError(f"cannot write {out}: {error.strerror}; name a file in an existing folder") from None
-    typer.echo(out)
 
 
 @app.command()
@@ -284,41 +164,24 @@ def bench(
 ) -> None:
     """Measure speed, each figure beside a reference of the same run."""
     sizes = {"seconds": seconds, "rounds": rounds}
-    result = benchmarks.measure(name, **{key: value for key, value in sizes.items() if value is not None})
+    chosen = {key: value for key, value in sizes.items() if value is not None}
+    measurement = benchmarks.measure(name, terminal.say, **chosen)
     if as_json:
-        typer.echo(json.dumps(result))
-    else:
-        rows = [{"key": key, "value": value} for key, value in result["results"].items()]
-        title = f"{name} at commit {result['commit']}, {result['threads']} thread(s)"
-        terminal.print_rows(title, rows, {"key": ("key", "{}"), "value": ("value", "{:.4g}")})
-        typer.echo("".join(f"{note}\n" for note in result["notes"]), nl=False)
+        typer.echo(measurement.to_json())
+        return
+    rows = [{"key": key, "value": value} for key, value in measurement.results.items()]
+    title = f"{name} at commit {measurement.provenance.commit}, {measurement.threads} thread(s)"
+    terminal.print_rows(title, rows, {"key": ("key", "{}"), "value": ("value", "{:.4g}")})
+    typer.echo("".join(f"{note}\n" for note in measurement.notes), nl=False)
 
 
+stored.add_to(app)
 live.add_to(app)
-
-
-def _check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, ...], reason: str) -> None:
-    for override in overrides or []:
-        if not override.startswith(allowed):
-            raise ConfigError(
-                f"{command} cannot change {override.partition('=')[0]}: {reason}; "
-                f"allowed: keys that start with {', '.join(allowed)}"
-            )
-
-
-def _with_workers(overrides: list[str] | None, workers: int | None, autoscale: str | None = None) -> list[str]:
-    wanted = [] if workers is None else [f"run.workers={workers}"]
-    if autoscale is not None:
-        least, colon, most = autoscale.partition(":")
-        if not (colon and least.isdecimal() and most.isdecimal()):
-            raise ConfigError(f"--autoscale takes MIN:MAX, found '{autoscale}'; for example --autoscale 1:8")
-        wanted += [f"run.workers_min={least}", f"run.workers_max={most}"]
-    return (overrides or []) + wanted
 
 
 def _free_name(root: Path, name: str) -> str:
     """`name`, or the first of name-2, name-3, ... that no run has."""
-    taken = {this.name for this in catalog.list_runs(root)}
+    taken = {run.name for run in catalog.list_runs(root)}
     number = 2
     free = name
     while free in taken:
@@ -326,9 +189,15 @@ def _free_name(root: Path, name: str) -> str:
     return free
 
 
-def _again(this: Run, source: str, root: Path, overrides: list[str] | None) -> str:
-    parts = ["t6gps", "train", source, "--run", this.name, "--root", str(root), "--resume"]
-    return shlex.join(parts + [f"--set={override}" for override in overrides or []])
+def _exit_interrupted(command: list[str]) -> NoReturn:
+    """Say how to continue what Ctrl-C or SIGTERM has stopped, and exit."""
+    terminal.say(f"stopped; everything sampled so far is kept. Resume with: {shlex.join(command)}")
+    raise typer.Exit(EXIT_INTERRUPTED) from None
+
+
+def _train_command(run: Run, source: str, root: Path, overrides: list[str] | None) -> list[str]:
+    parts = ["t6gps", "train", source, "--run", run.name, "--root", str(root), "--resume"]
+    return parts + [f"--set={override}" for override in overrides or []]
 
 
 def _study_command(
@@ -340,27 +209,6 @@ def _study_command(
     parts += [] if root == DEFAULT_ROOT else ["--root", str(root)]
     parts += [] if out is None else ["--out", str(out)]
     return parts + [f"--set={override}" for override in overrides or []]
-
-
-def _print_learning(this: Run) -> None:
-    rows: list[dict[str, Any]] = tables.read(this, "iterations").sort_by("iteration").to_pylist()
-    terminal.print_rows(f"Run {this.name}", rows, terminal.LEARNING_COLUMNS)
-
-
-def _print_paths(this: Run, pictures: list[Path], root: Path) -> None:
-    place = f" --root {shlex.quote(str(root))}" if root != DEFAULT_ROOT else ""
-    lines = [
-        f"dataset      {this.tables}",
-        f"checkpoints  {this.checkpoints}",
-        *(f"figure       {picture}" for picture in pictures),
-        "",
-        "Try next:",
-        f"  t6gps eval {this.name} --episodes 40 --seed 7{place}",
-        f'  t6gps query {this.name} "SELECT iteration, avg(forward_speed_m_per_s) AS m_per_s FROM episodes '
-        f'GROUP BY iteration ORDER BY iteration"{place}',
-        f"  t6gps render {this.name} 0 --out episode.mp4{place}",
-    ]
-    typer.echo("\n".join(lines))
 
 
 if __name__ == "__main__":

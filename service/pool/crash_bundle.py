@@ -12,20 +12,18 @@ import json
 import platform
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
-from importlib import metadata
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from t6gps.service.pool.attempt import Failure, Runner, attempt
+from t6gps.service.provenance import versions
 from t6gps.storage import checkpoint, durable
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.settings import RolloutSettings
 from t6gps.workers.worker import RolloutWorker
-
-PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "ray")
 
 
 @dataclass(frozen=True)
@@ -60,7 +58,7 @@ def write(
         "settings": settings.model_dump(),
         "policy": {"version": snapshot.version, "offset_m": snapshot.offset_m, "scale_m": snapshot.scale_m},
         "failures": [asdict(failure) for failure in failures],
-        "versions": {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()},
+        "versions": versions(),
         "platform": platform.platform(),
     }
     durable.hidden(path).write_text(json.dumps(record, indent=1) + "\n")

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from itertools import cycle
-from typing import Any
 
 import numpy as np
+import pyarrow as pa
 import pyarrow.compute as pc
 from matplotlib import rc_context
 from matplotlib.axes import Axes
@@ -34,9 +34,9 @@ Values = np.ndarray
 def by_panel(finished: Sequence[Finished]) -> dict[str, dict[str, list[Finished]]]:
     """Runs by panel and label, in the order of their declaration."""
     panels: dict[str, dict[str, list[Finished]]] = {}
-    for one in finished:
-        arm = one.trial.declared
-        panels.setdefault(arm.panel, {}).setdefault(arm.label, []).append(one)
+    for outcome in finished:
+        arm = outcome.trial.declared
+        panels.setdefault(arm.panel, {}).setdefault(arm.label, []).append(outcome)
     return panels
 
 
@@ -51,8 +51,8 @@ def evaluations(finished: Sequence[Finished]) -> Figure:
             for column, (key, (title, factor)) in enumerate(QUANTITIES.items()):
                 axes = row[column]
                 for place, (runs, colour) in enumerate(zip(labels.values(), cycle(COLOURS), strict=False)):
-                    found = [one.evaluation[key]["mean"] for one in runs]
-                    values = factor * np.array([value for value in found if value is not None])
+                    means = [outcome.evaluation[key]["mean"] for outcome in runs]
+                    values = factor * np.array([mean for mean in means if mean is not None])
                     if len(values):
                         _dots(axes, place, values, colour)
                 axes.set_yticks(range(len(labels)), list(labels) if column == 0 else [""] * len(labels))
@@ -76,8 +76,8 @@ def learning(finished: Sequence[Finished]) -> Figure:
 
     Over the steps sampled before where iterations differ in size.
     """
-    learners = [one for one in finished if one.trial.declared.peer is None]
-    panels, same_size = by_panel(learners), len({_iteration_steps(one) for one in learners}) == 1
+    learners = [outcome for outcome in finished if outcome.trial.declared.baseline is None]
+    panels, same_size = by_panel(learners), len({_iteration_steps(outcome) for outcome in learners}) == 1
     with rc_context(STYLE):
         figure = canvas(1.5 + 4 * len(panels), 6)
         grid = figure.subplots(len(LEARNING), len(panels), squeeze=False, sharey="row", sharex=True)
@@ -85,7 +85,7 @@ def learning(finished: Sequence[Finished]) -> Figure:
             for row, (key, title) in enumerate(LEARNING.items()):
                 axes = grid[row, column]
                 for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
-                    curves = np.array([numbers(_iterations(one), key) for one in runs])
+                    curves = np.array([numbers(_iterations(outcome), key) for outcome in runs])
                     x = np.arange(curves.shape[1]) * (1.0 if same_size else _iteration_steps(runs[0]) / 1000)
                     axes.fill_between(x, curves.min(axis=0), curves.max(axis=0), color=colour, alpha=0.15, linewidth=0)
                     axes.plot(x, curves.mean(axis=0), color=colour, marker="o", markersize=4, label=label)
@@ -100,17 +100,17 @@ def learning(finished: Sequence[Finished]) -> Figure:
     return figure
 
 
-def _iteration_steps(one: Finished) -> int:
-    return one.trial.config.run.episodes * one.trial.config.run.steps
+def _iteration_steps(outcome: Finished) -> int:
+    return outcome.trial.config.run.episodes * outcome.trial.config.run.steps
 
 
-def _iterations(one: Finished) -> Any:
-    return tables.read(one.run, "iterations").sort_by("iteration")
+def _iterations(outcome: Finished) -> pa.Table:
+    return tables.read(outcome.run, "iterations").sort_by("iteration")
 
 
-def _newest(one: Finished, table: str, columns: list[str]) -> Any:
-    newest = tables.committed_iterations(one.run) - 1
-    return tables.read(one.run, table, columns, pc.field("iteration") == newest)
+def _newest(outcome: Finished, table: str, columns: list[str]) -> pa.Table:
+    newest = tables.committed_iterations(outcome.run) - 1
+    return tables.read(outcome.run, table, columns, pc.field("iteration") == newest)
 
 
 def speed_distribution(finished: Sequence[Finished]) -> Figure:
@@ -123,7 +123,7 @@ def speed_distribution(finished: Sequence[Finished]) -> Figure:
             figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
         ):
             for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
-                speeds = [numbers(_newest(one, "frames", ["forward_speed_m_per_s"]), SPEED) for one in runs]
+                speeds = [numbers(_newest(outcome, "frames", ["forward_speed_m_per_s"]), SPEED) for outcome in runs]
                 axes.hist(np.concatenate(speeds), bins, density=True, histtype="step", color=colour, label=label)
             axes.axvline(0, color=DARK, linewidth=0.8)
             axes.set(title=panel, xlabel="speed to the waypoint (m/s)", ylabel="density (s/m)")
@@ -143,9 +143,9 @@ def modes_per_class(finished: Sequence[Finished]) -> Figure:
             figure.subplots(1, len(panels), squeeze=False)[0], panels.items(), strict=True
         ):
             for (label, runs), colour in zip(labels.items(), cycle(COLOURS), strict=False):
-                rows = [row for one in runs for row in _newest(one, "classes", CLASS_COLUMNS).to_pylist()]
-                own = [row for row in rows if not row["pooled"]]
-                sizes, modes = [row["segments"] for row in own], [row["modes"] for row in own]
+                rows = [row for outcome in runs for row in _newest(outcome, "classes", CLASS_COLUMNS).to_pylist()]
+                alone = [row for row in rows if not row["pooled"]]
+                sizes, modes = [row["segments"] for row in alone], [row["modes"] for row in alone]
                 axes.plot(sizes, modes, linestyle="", marker="o", alpha=0.6, color=colour, label=label)
             axes.set(title=panel, xlabel="segments of the class", ylabel="modes per time step", xscale="log")
         axes.legend()
@@ -156,8 +156,8 @@ def conditions(finished: Sequence[Finished]) -> Figure:
     """Speed and stuck share of every arm in its own world and under each condition: a dot per seed."""
     names = list(finished[0].conditions)
     arms: dict[str, list[Finished]] = {}
-    for one in finished:
-        arms.setdefault(one.trial.declared.label, []).append(one)
+    for outcome in finished:
+        arms.setdefault(outcome.trial.declared.label, []).append(outcome)
     chosen = ("forward_speed_m_per_s", "stuck_share_by_distance")
     with rc_context(STYLE):
         figure = canvas(9, 1.3 + 0.3 * (len(names) + 1) * len(arms))
@@ -167,8 +167,9 @@ def conditions(finished: Sequence[Finished]) -> Figure:
                 colour, lift = COLOURS[shift % len(COLOURS)], 0.7 * (shift - (len(arms) - 1) / 2) / len(arms)
                 axes.plot([], [], color=colour, marker="o", linestyle="", label=label)
                 for place, name in enumerate([None, *names]):
-                    found = [(one.evaluation if name is None else one.conditions[name])[key]["mean"] for one in runs]
-                    _dots(axes, place + lift, factor * np.array(found), colour)
+                    worlds = [outcome.evaluation if name is None else outcome.conditions[name] for outcome in runs]
+                    means = np.array([evaluation[key]["mean"] for evaluation in worlds])
+                    _dots(axes, place + lift, factor * means, colour)
             axes.set_yticks(range(len(names) + 1), ["as trained", *names])
             axes.set_ylim(len(names) + 0.6, -0.6)
             axes.set_xlabel(title)

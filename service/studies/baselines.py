@@ -1,14 +1,14 @@
 """Controllers to compare with: a gait by hand, an evolved open-loop gait, and PPO from stable-baselines3.
 
 Each samples as many control steps as the run's configuration says (PPO rounds them up to whole batches of 2048) and is
-evaluated on the same episodes as T6-GPS. A peer that is interrupted starts anew, since its training is short.
+evaluated on the same episodes as T6-GPS. A baseline that is interrupted starts anew, since its training is short.
 """
 
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from typing import Any
+from collections.abc import Sequence
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.studies.declared import Peer
+from t6gps.service.studies.declared import Baseline
+from t6gps.service.studies.watcher import Progress, Watcher
 from t6gps.service.training import evaluation, session
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.service.views import terminal
+from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint, durable
 from t6gps.storage.catalog import Run
+from t6gps.storage.checkpoint import JSON
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.records import EpisodePlan
 from t6gps.workers.episode import gaits
@@ -29,39 +31,42 @@ from t6gps.workers.episode.rollout import Controller, controlled
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.robot.neutral import nominal_rest_length
 
+if TYPE_CHECKING:
+    from stable_baselines3 import PPO
+
 Array = NDArray[np.float64]
-Progress = Callable[[int, int], None]
 
-
-PEERS_STREAM = 4
+BASELINES_STREAM = 4
 """First spawn key below the run's seed; `seeding` has the others."""
 OFFSPRING_N, PARENTS_N = 12, 4
 FIRST_SPREAD, SPREAD_DECAY = 0.5, 0.97
 """Standard deviation of the first generation, in units of `gaits.WAVE_SCALE_M`, and its factor per generation."""
 EVOLUTION_STEPS = 100
-PPO_OPTIONS: dict[str, Any] = {"n_steps": 2048, "batch_size": 256, "gamma": 0.95, "device": "cpu"}
-"""Beside stable-baselines3's defaults: a horizon of about two seconds, as long as sub-trajectories look ahead."""
+PPO_STEPS_N, PPO_BATCH_N = 2048, 256
+PPO_DISCOUNT = 0.95
+"""A horizon of about two seconds, as long as sub-trajectories look ahead; the rest are stable-baselines3's defaults."""
 
 
-def complete(peer: Peer, config: Config, this: Run) -> None:
-    """Train a peer with the steps that `config` allows, keep what it learned, and keep its evaluation."""
+def complete(baseline: Baseline, config: Config, run: Run, watcher: Watcher) -> None:
+    """Train a baseline with the steps that `config` allows, keep what it learned, and keep its evaluation."""
     steps = config.run.iterations * config.run.episodes * config.run.steps
-    with catalog.locked(this), terminal.task(f"training {peer.value}") as progress:
-        if peer is Peer.PERIODIC:
-            _keep_gait(this, evolve(config, steps, progress))
-        elif peer is Peer.PPO:
+    with catalog.locked(run), watcher.task(f"training {baseline.value}") as progress:
+        if baseline is Baseline.PERIODIC:
+            _keep_gait(run, evolve(config, steps, progress))
+        elif baseline is Baseline.PPO:
             model = train_ppo(config, steps, progress)
-            checkpoint.save(this.checkpoints, config.run.iterations, *learner_state(model, config))
-    evaluation.keep(this, evaluate(peer, this, (), serial=True))
+            checkpoint.save(run.checkpoints, config.run.iterations, *learner_state(model, config))
+    with watcher.run(config.run.iterations) as observer:
+        evaluation.keep(run, evaluate(baseline, run, (), True, observer))
 
 
-def evaluate(peer: Peer, this: Run, overrides: Sequence[str], serial: bool) -> Evaluation:
-    """The evaluation of a finished peer on the episodes that any policy of this run would get."""
-    if peer is Peer.PPO:
-        return session.evaluate_newest(this, overrides, serial)
-    config = configuration.parse(this.config_path.read_text(), overrides)
+def evaluate(baseline: Baseline, run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:
+    """The evaluation of a finished baseline on the episodes that any policy of this run would get."""
+    if baseline is Baseline.PPO:
+        return session.evaluate_newest(run, overrides, serial, observer)
+    config = configuration.parse(run.config_path.read_text(), overrides)
     nominal_m = nominal_rest_length(config.robot)
-    control = gaits.flop(nominal_m) if peer is Peer.FLOP else gaits.waves(nominal_m, _kept_gait(this))
+    control = gaits.flop(nominal_m) if baseline is Baseline.FLOP else gaits.waves(nominal_m, _kept_gait(run))
     size = config.run
     plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
     with PyBulletEngine(config.robot) as simulation:
@@ -69,14 +74,14 @@ def evaluate(peer: Peer, this: Run, overrides: Sequence[str], serial: bool) -> E
     return evaluation.summarise(summaries, size.seed)
 
 
-def _keep_gait(this: Run, parameters: Array) -> None:
-    path = this.path / "gait.json"
+def _keep_gait(run: Run, parameters: Array) -> None:
+    path = run.path / "gait.json"
     durable.hidden(path).write_text(json.dumps(parameters.tolist()))
     durable.publish(path)
 
 
-def _kept_gait(this: Run) -> Array:
-    return np.array(json.loads((this.path / "gait.json").read_text()))
+def _kept_gait(run: Run) -> Array:
+    return np.array(json.loads((run.path / "gait.json").read_text()))
 
 
 def evolve(config: Config, steps: int, progress: Progress) -> Array:
@@ -87,7 +92,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
     generations = steps // (OFFSPRING_N * EVOLUTION_STEPS)
     if not generations:
         raise RunError(f"{steps} steps make up no generation of {OFFSPRING_N} x {EVOLUTION_STEPS}; allow more steps")
-    rng = np.random.default_rng(np.random.SeedSequence(config.run.seed, spawn_key=(PEERS_STREAM,)))
+    rng = np.random.default_rng(np.random.SeedSequence(config.run.seed, spawn_key=(BASELINES_STREAM,)))
     settings = config.rollout
     terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": None})
     settings = settings.model_copy(
@@ -115,30 +120,31 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
     return best
 
 
-def train_ppo(config: Config, steps: int, progress: Progress) -> Any:
+def train_ppo(config: Config, steps: int, progress: Progress) -> PPO:
     """The PPO model that `steps` steps of the Gymnasium environment make. ConfigError without stable-baselines3."""
     import torch
 
     torch.set_num_threads(1)
     model = new_ppo(config)
 
-    def follow(state: dict[str, Any], _: dict[str, Any]) -> bool:
-        progress(min(state["self"].num_timesteps, steps), steps)
+    def follow(_: object, __: object) -> bool:
+        progress(min(model.num_timesteps, steps), steps)
         return True
 
     model.learn(steps, callback=follow)
-    model.env.close()
+    if model.env is not None:
+        model.env.close()
     return model
 
 
-def new_ppo(config: Config) -> Any:
+def new_ppo(config: Config) -> PPO:
     """An untrained PPO model whose actor is a tanh network with the layers of the policy of T6-GPS."""
     try:
         from stable_baselines3 import PPO
     except ModuleNotFoundError as error:
-        raise ConfigError("PPO needs stable-baselines3, which is not installed; run: pip install 't6gps[peers]'") from (
-            error
-        )
+        raise ConfigError(
+            "PPO needs stable-baselines3, which is not installed; run: pip install 't6gps[baselines]'"
+        ) from error
     from gymnasium.wrappers import TimeLimit
     from torch.nn import Tanh
 
@@ -146,10 +152,19 @@ def new_ppo(config: Config) -> Any:
 
     environment = TimeLimit(SuperBallEnvironment(config.robot, config.task, config.terrain), config.run.steps)
     network = {"net_arch": list(config.learner.hidden_layers), "activation_fn": Tanh, "log_std_init": -1.0}
-    return PPO("MlpPolicy", environment, policy_kwargs=network, seed=config.run.seed, **PPO_OPTIONS)
+    return PPO(
+        "MlpPolicy",
+        environment,
+        n_steps=PPO_STEPS_N,
+        batch_size=PPO_BATCH_N,
+        gamma=PPO_DISCOUNT,
+        policy_kwargs=network,
+        seed=config.run.seed,
+        device="cpu",
+    )
 
 
-def learner_state(model: Any, config: Config) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+def learner_state(model: PPO, config: Config) -> tuple[dict[str, JSON], dict[str, NDArray[np.float32]]]:
     """State of a learner (`Learner.restore`) whose policy commands the mean action of a PPO model."""
     weights, hidden_n = model.policy.state_dict(), len(config.learner.hidden_layers)
     names = [*(f"mlp_extractor.policy_net.{2 * number}" for number in range(hidden_n)), "action_net"]
@@ -163,7 +178,7 @@ def learner_state(model: Any, config: Config) -> tuple[dict[str, Any], dict[str,
     offset_m = nominal_rest_length(config.robot)
     # Actions -1 .. 1 span the commands about their middle; the snapshot puts zero at the nominal rest length.
     arrays[f"layer_{len(names) - 1}_bias"] += np.float32((middle_m - offset_m) / half_m)
-    manifest = {
+    manifest: dict[str, JSON] = {
         "version": config.run.iterations,
         "offset_m": offset_m,
         "scale_m": half_m,

@@ -1,35 +1,31 @@
 """Conducts a study: its arms times its seeds as ordinary runs, and a folder with what came out.
 
-Running it again goes on where it stopped. A run is finished when its evaluation is kept; an unfinished one is resumed;
-what is there must have the configuration that the study asks for.
+A study that is run again resumes where it stopped. A run is finished when its evaluation is kept; an unfinished one is
+resumed; what is there must have the configuration that the study asks for.
 """
 
 from __future__ import annotations
 
-import json
-import os
 import time
-from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from fnmatch import fnmatchcase
 from pathlib import Path
-from typing import Any
 
 from t6gps.service import config as configuration
-from t6gps.service.bench.registry import commit
 from t6gps.service.config import Config
+from t6gps.service.provenance import commit
 from t6gps.service.studies import baselines
-from t6gps.service.studies.declared import PAPER, PAPER_SEEDS, Arm, Peer, Scale, Study
+from t6gps.service.studies.declared import PAPER, PAPER_SEEDS, Arm, Baseline, Scale, Study
+from t6gps.service.studies.origin import Origin, origin, recorded
+from t6gps.service.studies.watcher import Watcher
 from t6gps.service.training import evaluation, session
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.service.views.terminal import console
-from t6gps.storage import catalog, durable
+from t6gps.service.views import run_figures
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
 
-ORIGIN = "origin.json"
-"""Beside a run's tables: study, arm and seed, the commits that worked on it, and the seconds they took."""
 SECONDS_PER_STEP = {True: 0.0005, False: 0.0003}
 SECONDS_PER_RUN, SECONDS_PER_CONDITION = 10.0, 5.0
 """Of two idle cores, on rough and on flat ground, learning included; to start and to draw (for the estimate alone)."""
@@ -55,7 +51,7 @@ class Trial:
     def training_steps(self) -> int:
         """Control steps that it learns from, I x N x T; none for a gait made by hand."""
         size = self.config.run
-        return 0 if self.declared.peer is Peer.FLOP else size.iterations * size.episodes * size.steps
+        return 0 if self.declared.baseline is Baseline.FLOP else size.iterations * size.episodes * size.steps
 
 
 @dataclass(frozen=True)
@@ -66,7 +62,7 @@ class Finished:
     run: Run
     evaluation: Evaluation
     conditions: dict[str, Evaluation]
-    origin: dict[str, Any]
+    origin: Origin
 
 
 def trials(
@@ -112,22 +108,23 @@ def check_learnable(config: Config, where: str) -> None:
 
 
 def conduct(
-    planned: Sequence[Trial], root: Path, study: str, conditions: Mapping[str, tuple[str, ...]], serial: bool
+    planned: Sequence[Trial],
+    root: Path,
+    study: str,
+    conditions: Mapping[str, tuple[str, ...]],
+    serial: bool,
+    watcher: Watcher,
+    present: str | None = None,
 ) -> list[Finished]:
     """Run what is missing of the trials below `root`, then evaluate each policy under `conditions` (overrides by name).
 
     Returns the results in the order of the plan. RunError if a run of that name has another configuration, before
-    anything is sampled. Runs that another commit began are kept and said to be so.
+    anything is sampled. Runs that another commit began are kept and said to be so; `present` is the commit at work,
+    by default the one that is checked out.
     """
-    present = commit()
-    there = {this.name: this for this in catalog.list_runs(root)}
-    runs = {trial.name: there[trial.name] for trial in planned if trial.name in there}
-    for trial in planned:
-        if trial.name in runs:
-            session.check_unchanged(
-                runs[trial.name], trial.config, "give another --root, or the settings that the study was begun with"
-            )
-    _warn_of_other_commits(list(runs.values()), present)
+    present = present or commit()
+    runs = _begun(planned, root)
+    _warn_of_other_commits(list(runs.values()), present, watcher)
     missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]
     unseen = [
         (trial, condition)
@@ -135,77 +132,75 @@ def conduct(
         for condition in conditions
         if trial.name not in runs or evaluation.kept(runs[trial.name], condition) is None
     ]
-    left_s = estimate_s(missing, 0) + sum(estimate_s([trial], 1) - estimate_s([trial], 0) for trial, _ in unseen)
-    _say(
+    left_s = estimate_s(missing, 0) + sum(_condition_s(trial) for trial, _ in unseen)
+    watcher.say(
         f"{len(planned)} runs, {len(planned) - len(missing)} of them finished, {len(unseen)} evaluations under other "
         f"conditions to come: about {minutes(left_s)} on two idle cores"
     )
     pace = _Pace(left_s)
     for number, trial in enumerate(missing, len(planned) - len(missing) + 1):
-        _say(f"run {number} of {len(planned)}: arm {trial.arm}, seed {trial.seed}; {minutes(pace.left_s())} left")
-        this = runs.get(trial.name) or catalog.create(root, trial.name, trial.config.to_json())
-        with _recorded(this, {"study": study, "arm": trial.arm, "seed": trial.seed}, present):
-            if trial.declared.peer is None:
-                session.complete(trial.config, this, serial)
-            else:
-                baselines.complete(trial.declared.peer, trial.config, this)
+        progress = f"run {number} of {len(planned)}: arm {trial.arm}, seed {trial.seed}"
+        watcher.say(f"{progress}; {minutes(pace.left_s())} left")
+        run = runs.get(trial.name) or catalog.create(root, trial.name, trial.config.to_json())
+        with recorded(run, study, trial.arm, trial.seed, present):
+            _complete(trial, run, serial, watcher)
         pace.done(estimate_s([trial], 0))
     for number, (trial, condition) in enumerate(unseen, 1):
-        _say(f"condition {number} of {len(unseen)}: {condition}, run {trial.name}; {minutes(pace.left_s())} left")
-        this, peer = catalog.open_run(root, trial.name), trial.declared.peer
-        if peer is None:
-            found = session.evaluate_newest(this, conditions[condition], serial)
-        else:
-            found = baselines.evaluate(peer, this, conditions[condition], serial)
-        evaluation.keep(this, found, condition)
-        pace.done(estimate_s([trial], 1) - estimate_s([trial], 0))
+        progress = f"condition {number} of {len(unseen)}: {condition}, run {trial.name}"
+        watcher.say(f"{progress}; {minutes(pace.left_s())} left")
+        run = catalog.open_run(root, trial.name)
+        evaluation.keep(run, _evaluated(trial, run, conditions[condition], serial, watcher), condition)
+        pace.done(_condition_s(trial))
     return [_finished(root, trial, conditions) for trial in planned]
 
 
+def _begun(planned: Sequence[Trial], root: Path) -> dict[str, Run]:
+    """The trials' runs that are there, by name. RunError if one has another configuration than its trial."""
+    there = {run.name: run for run in catalog.list_runs(root)}
+    runs = {trial.name: there[trial.name] for trial in planned if trial.name in there}
+    for trial in planned:
+        if trial.name in runs:
+            session.check_unchanged(
+                runs[trial.name], trial.config, "give another --root, or the settings that the study was begun with"
+            )
+    return runs
+
+
+def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
+    """Train, evaluate and draw what is missing of a trial."""
+    if trial.declared.baseline is not None:
+        baselines.complete(trial.declared.baseline, trial.config, run, watcher)
+        return
+    with watcher.run(trial.config.run.iterations) as observer:
+        session.complete(trial.config, run, serial, observer)
+    run_figures.draw(run, trial.config.terrain)
+
+
+def _evaluated(trial: Trial, run: Run, overrides: Sequence[str], serial: bool, watcher: Watcher) -> Evaluation:
+    """The evaluation of a trial's policy in the world that the overrides change."""
+    with watcher.run(trial.config.run.iterations) as observer:
+        if trial.declared.baseline is not None:
+            return baselines.evaluate(trial.declared.baseline, run, overrides, serial, observer)
+        return session.evaluate_newest(run, overrides, serial, observer)
+
+
 def _finished(root: Path, trial: Trial, conditions: Iterable[str]) -> Finished:
-    this = catalog.open_run(root, trial.name)
-    kept = {condition: evaluation.kept(this, condition) for condition in (None, *conditions)}
-    results = {condition: result for condition, result in kept.items() if result is not None}
-    if len(results) < len(kept):
-        raise RunError(f"run {trial.name} lost an evaluation while the study went on; run the study again")
-    own = results.pop(None)
-    return Finished(trial, this, own, {str(name): result for name, result in results.items()}, origin(this))
+    run = catalog.open_run(root, trial.name)
+    as_trained = evaluation.kept(run)
+    results = {condition: evaluation.kept(run, condition) for condition in conditions}
+    known = {condition: result for condition, result in results.items() if result is not None}
+    if as_trained is None or len(known) < len(results):
+        raise RunError(f"run {trial.name} lost an evaluation while the study was running; run the study again")
+    return Finished(trial, run, as_trained, known, origin(run))
 
 
-def origin(this: Run) -> dict[str, Any]:
-    """Where a study's run comes from: {"study", "arm", "seed", "commits", "wall_s", "cores"}."""
-    path = this.path / ORIGIN
-    return json.loads(path.read_text()) if path.exists() else {"commits": [], "wall_s": 0.0}
-
-
-@contextmanager
-def _recorded(this: Run, identity: dict[str, Any], present: str) -> Iterator[None]:
-    """Add the commit and the time of what runs inside to the run's origin, also when it is interrupted."""
-    before, start = origin(this), time.perf_counter()
-    commits = [*before["commits"], *([present] if present not in before["commits"] else [])]
-
-    def keep() -> None:
-        wall_s = before["wall_s"] + time.perf_counter() - start
-        record = {**identity, "commits": commits, "wall_s": round(wall_s, 1), "cores": os.cpu_count()}
-        path = this.path / ORIGIN
-        durable.hidden(path).write_text(json.dumps(record, indent=2) + "\n")
-        durable.publish(path)
-
-    keep()
-    try:
-        yield
-    finally:
-        keep()
-
-
-def _warn_of_other_commits(runs: Sequence[Run], present: str) -> None:
-    for this in runs:
-        others = [found for found in origin(this)["commits"] if found != present]
+def _warn_of_other_commits(runs: Sequence[Run], present: str, watcher: Watcher) -> None:
+    for run in runs:
+        others = [commit for commit in origin(run).commits if commit != present]
         if others:
-            _say(
-                f"warning: run {this.name} comes from commit {', '.join(others)}, this is {present}; its data may "
-                "differ from what this commit samples (another --root starts afresh)",
-                style="yellow",
+            watcher.warn(
+                f"run {run.name} comes from commit {', '.join(others)}, this is {present}; its data may differ from "
+                "what this commit samples (another --root starts afresh)"
             )
 
 
@@ -235,10 +230,11 @@ def estimate_s(planned: Sequence[Trial], conditions_n: int) -> float:
     return total_s
 
 
+def _condition_s(trial: Trial) -> float:
+    """Seconds of two idle cores for the evaluation of a trial under another condition."""
+    return estimate_s([trial], 1) - estimate_s([trial], 0)
+
+
 def minutes(seconds: float) -> str:
     """A duration for people."""
     return f"{seconds / 60:.0f} min" if seconds >= 90 else f"{seconds:.0f} s"
-
-
-def _say(text: str, style: str | None = None) -> None:
-    console.print(text, style=style, highlight=False, soft_wrap=True, markup=False)

@@ -1,6 +1,6 @@
 """The studies as declarations: which arms are compared, at which size, and which figures show the answer.
 
-An arm is a preset with overrides; each is trained with the same seeds. `study` conducts them.
+An arm is a preset with overrides; each is trained with the same seeds. `conduct` runs them.
 """
 
 from __future__ import annotations
@@ -20,8 +20,8 @@ class Scale(StrEnum):
     PAPER = "paper"
 
 
-class Peer(StrEnum):
-    """What may stand in the place of T6-GPS (`peers`)."""
+class Baseline(StrEnum):
+    """What may stand in the place of T6-GPS (`baselines`)."""
 
     FLOP = "flop"
     PERIODIC = "periodic"
@@ -33,7 +33,7 @@ class Arm:
     """One of the things compared.
 
     label, panel   in figures: arms of one panel are drawn together and told apart by their label
-    peer           what stands in the place of T6-GPS, if anything
+    baseline       what stands in the place of T6-GPS, if anything
     sizes          further overrides at one scale, after those of the study
     """
 
@@ -41,7 +41,7 @@ class Arm:
     panel: str
     preset: str
     overrides: tuple[str, ...] = ()
-    peer: Peer | None = None
+    baseline: Baseline | None = None
     sizes: Mapping[Scale, tuple[str, ...]] = field(default_factory=dict)
 
 
@@ -51,7 +51,7 @@ class Study:
 
     paper_arms   further arms, which learn nothing from fewer steps than the paper's
     quick        overrides that, with `quick_seeds`, end the study within half an hour on two cores
-    figures      names of figures in `study_figures.FIGURES`, beside the evaluation and the learning curves
+    figures      names of figures in `arm_figures.FIGURES`, beside the evaluation and the learning curves
     conditions   worlds (overrides by name) in which each policy is evaluated beside its own
     policies_of  the study whose runs it evaluates, None if it trains its own
     """
@@ -280,12 +280,12 @@ STUDIES = {
             "loop cannot steer: the condition one-way, from rest along +x, is the one its gait was evolved for."
         ),
         arms={
-            label.split()[0].lower(): Arm(label, "flat ground", "flat", NO_VALUE, peer=peer)
-            for label, peer in (
+            label.split()[0].lower(): Arm(label, "flat ground", "flat", NO_VALUE, baseline=baseline)
+            for label, baseline in (
                 ("T6-GPS", None),
-                ("flop gait", Peer.FLOP),
-                ("periodic gait, evolved", Peer.PERIODIC),
-                ("PPO", Peer.PPO),
+                ("flop gait", Baseline.FLOP),
+                ("periodic gait, evolved", Baseline.PERIODIC),
+                ("PPO", Baseline.PPO),
             )
         },
         quick=("run.episodes=60",),

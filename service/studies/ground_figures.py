@@ -81,7 +81,7 @@ FOOTPRINT_MARGIN_M = 1.2
 class Climb:
     """The largest climb of a study: its run, its episode's frames by step and ground, and its first and last step."""
 
-    one: Finished
+    outcome: Finished
     frames: pa.Table
     terrain: Terrain | None
     episode_id: int
@@ -101,14 +101,14 @@ def ground_track(finished: Sequence[Finished]) -> Figure:
 
 def largest_climb(finished: Sequence[Finished]) -> Climb:
     """The largest height gain among the stored episodes of all runs."""
-    tops = [(query(one.run, LARGEST_CLIMBS).slice(0, 1).to_pylist()[0], one) for one in finished]
-    best, one = max(tops, key=lambda item: item[0]["gain_m"])
-    frames = tables.episode_frames(one.run, best["episode_id"]).sort_by("step")
-    row = tables.read(one.run, "episodes", filter=pc.field("episode_id") == best["episode_id"]).to_pylist()[0]
-    terrain = ground(one.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+    tops = [(query(outcome.run, LARGEST_CLIMBS).slice(0, 1).to_pylist()[0], outcome) for outcome in finished]
+    best, outcome = max(tops, key=lambda item: item[0]["gain_m"])
+    frames = tables.episode_frames(outcome.run, best["episode_id"]).sort_by("step")
+    row = tables.read(outcome.run, "episodes", filter=pc.field("episode_id") == best["episode_id"]).to_pylist()[0]
+    terrain = ground(outcome.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
     top = best["top_step"]
     bottom = int(_smooth(numbers(frames, "com_z_m"))[: top + 1].argmin())
-    return Climb(one, frames, terrain, best["episode_id"], best["gain_m"], bottom, top)
+    return Climb(outcome, frames, terrain, best["episode_id"], best["gain_m"], bottom, top)
 
 
 def _smooth(heights: Array) -> Array:
@@ -143,7 +143,7 @@ def footprints(finished: Sequence[Finished]) -> Figure:
         axes.plot(*shown[0], color=RED, marker="o", markersize=8, markeredgecolor="white", zorder=5)
         axes.annotate("start", shown[0], xytext=(8, 8), textcoords="offset points", fontweight="bold", zorder=6)
         seconds = (climb_.top - climb_.bottom) / 10
-        title = f"{climb_.one.run.name}, episode {climb_.episode_id}: {climb_.gain_m:.2f} m up in {seconds:.1f} s"
+        title = f"{climb_.outcome.run.name}, episode {climb_.episode_id}: {climb_.gain_m:.2f} m up in {seconds:.1f} s"
         axes.set(title=title, xlabel="x (m)", ylabel="y (m)", aspect="equal")
         axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
     return figure
@@ -167,7 +167,7 @@ def climb(finished: Sequence[Finished]) -> Figure:
         above, below = figure.subplots(2, 1, height_ratios=[2.6, 1])
         above.imshow(picture)
         above.set_axis_off()
-        above.set_title(f"{climb_.one.run.name}, episode {climb_.episode_id}, {climb_.gain_m:.2f} m up")
+        above.set_title(f"{climb_.outcome.run.name}, episode {climb_.episode_id}, {climb_.gain_m:.2f} m up")
         heights = numbers(climb_.frames, "com_z_m")
         time_s = numbers(climb_.frames, "time_s")
         below.plot(time_s, heights, color=RED, label="centre of mass")
@@ -183,7 +183,7 @@ def climb(finished: Sequence[Finished]) -> Figure:
 
 def climbs(finished: Sequence[Finished]) -> Figure:
     """How large the largest climbs of the episodes are, and the share that reaches two thirds of a bar."""
-    gains = np.concatenate([numbers(query(one.run, LARGEST_CLIMBS), "gain_m") for one in finished])
+    gains = np.concatenate([numbers(query(outcome.run, LARGEST_CLIMBS), "gain_m") for outcome in finished])
     with rc_context(STYLE):
         figure = canvas(7, 3.6)
         axes = figure.subplots()
@@ -204,13 +204,13 @@ def any_axis(finished: Sequence[Finished]) -> Figure:
     A triangle's own symmetry is divided out: turns by 120 deg of a Delta, the mirror of a Lambda. Evenness is the
     entropy over that of equal shares, 1 for motion along any axis and 0 along a single one.
     """
-    finished = [one for one in finished if one.trial.arm == finished[0].trial.arm]
+    finished = [outcome for outcome in finished if outcome.trial.arm == finished[0].trial.arm]
     sql = f"SELECT kind, com_velocity[1] AS vx, com_velocity[2] AS vy FROM frames WHERE {LATE}"
-    rows = pa.concat_tables([query(one.run, sql) for one in finished])
+    rows = pa.concat_tables([query(outcome.run, sql) for outcome in finished])
     velocity = np.column_stack([numbers(rows, "vx"), numbers(rows, "vy")])
     kind, moving = numbers(rows, "kind"), np.hypot(*velocity.T) > MOVING_M_PER_S
     angle_deg = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0]))
-    crossings = pa.concat_tables([query(one.run, TRANSITIONS) for one in finished]).group_by(
+    crossings = pa.concat_tables([query(outcome.run, TRANSITIONS) for outcome in finished]).group_by(
         ["kind", "entry_edge", "exit_edge"]
     )
     counts = crossings.aggregate([("transitions", "sum")]).sort_by([(name, "ascending") for name in ORDER])
@@ -230,7 +230,7 @@ def grades(finished: Sequence[Finished]) -> Figure:
 
     The rise is that of the plane which fits the ground within half a bar of the centre of mass best.
     """
-    finished = [one for one in finished if one.trial.arm == finished[0].trial.arm]
+    finished = [outcome for outcome in finished if outcome.trial.arm == finished[0].trial.arm]
     angle_deg, speed = (np.concatenate(part) for part in zip(*map(_rises, finished), strict=True))
     bounds = np.arange(-GRADES_DEG, GRADES_DEG + 1, GRADE_DEG)
     inside, middles = (np.abs(angle_deg) < GRADES_DEG), (bounds[1:] + bounds[:-1]) / 2
@@ -256,16 +256,16 @@ def grades(finished: Sequence[Finished]) -> Figure:
     return figure
 
 
-def _rises(one: Finished) -> tuple[Array, Array]:
+def _rises(outcome: Finished) -> tuple[Array, Array]:
     """Rise of the ground towards the waypoint (deg) and speed towards it (m/s), row by row."""
     columns = "episode_id, com_x_m, com_y_m, waypoint_x_m, waypoint_y_m, forward_speed_m_per_s"
-    rows = query(one.run, f"SELECT {columns} FROM frames WHERE {LATE} ORDER BY episode_id, step")
+    rows = query(outcome.run, f"SELECT {columns} FROM frames WHERE {LATE} ORDER BY episode_id, step")
     place = np.column_stack([numbers(rows, "com_x_m"), numbers(rows, "com_y_m")])
     ahead = np.column_stack([numbers(rows, "waypoint_x_m"), numbers(rows, "waypoint_y_m")]) - place
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)
     episode, rises = numbers(rows, "episode_id"), np.zeros(len(place))
-    for row in tables.read(one.run, "episodes", filter=pc.field("episode_id").isin(np.unique(episode))).to_pylist():
-        terrain = ground(one.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+    for row in tables.read(outcome.run, "episodes", filter=pc.field("episode_id").isin(np.unique(episode))).to_pylist():
+        terrain = ground(outcome.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
         chosen = episode == row["episode_id"]
         if terrain is not None:
             rises[chosen] = (slope(terrain, place[chosen]) * ahead[chosen]).sum(axis=1)

@@ -39,7 +39,7 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
     """Write the study's folder and return its files, the page first."""
     out.mkdir(parents=True, exist_ok=True)
     arms = arm_rows(finished)
-    learners = any(one.trial.declared.peer is None for one in finished)
+    learners = any(outcome.trial.declared.baseline is None for outcome in finished)
     drawn = ("evaluations", *(["learning"] if learners else []), *study.figures)
     pictures = [run_figures.save(FIGURES[figure](finished), out / f"{figure}.png") for figure in drawn]
     written = {
@@ -62,20 +62,20 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
 def run_rows(finished: Sequence[Finished]) -> list[Row]:
     """One row per run: its arm and seed, what it sampled, and its evaluation."""
     rows = []
-    for one in finished:
-        iterations = tables.read(one.run, "iterations").sort_by("iteration").to_pylist()
-        evaluated = {key: one.evaluation.get(key, {}).get("mean") for key in EVALUATED}
+    for outcome in finished:
+        iterations = tables.read(outcome.run, "iterations").sort_by("iteration").to_pylist()
+        evaluated = {key: outcome.evaluation.get(key, {}).get("mean") for key in EVALUATED}
         rows.append(
             {
-                "run": one.run.name,
-                "arm": one.trial.arm,
-                "seed": one.trial.seed,
-                "steps": one.trial.training_steps,
+                "run": outcome.run.name,
+                "arm": outcome.trial.arm,
+                "seed": outcome.trial.seed,
+                "steps": outcome.trial.training_steps,
                 **evaluated,
                 "modes": iterations[-1]["modes"] if iterations else None,
                 "learning_s": sum(row[key] for row in iterations for key in DURATIONS) if iterations else None,
-                "wall_s": one.origin["wall_s"],
-                "commits": " ".join(one.origin["commits"]),
+                "wall_s": outcome.origin.wall_s,
+                "commits": " ".join(outcome.origin.commits),
             }
         )
     return rows
@@ -86,11 +86,11 @@ def arm_rows(finished: Sequence[Finished]) -> list[Row]:
     rows = run_rows(finished)
     result = []
     for arm in dict.fromkeys(row["arm"] for row in rows):
-        own = [row for row in rows if row["arm"] == arm]
-        summary: Row = {"arm": arm, "seeds": len(own), "steps": own[0]["steps"]}
-        summary |= spread_of(own)
+        seeds = [row for row in rows if row["arm"] == arm]
+        summary: Row = {"arm": arm, "seeds": len(seeds), "steps": seeds[0]["steps"]}
+        summary |= spread_of(seeds)
         for key in ("modes", "learning_s", "wall_s"):
-            known = [row[key] for row in own if row[key] is not None]
+            known = [row[key] for row in seeds if row[key] is not None]
             summary[key] = float(np.mean(known)) if known else None
         result.append(summary)
     return result
@@ -99,9 +99,9 @@ def arm_rows(finished: Sequence[Finished]) -> list[Row]:
 def iteration_rows(finished: Sequence[Finished]) -> list[Row]:
     """One row per run and iteration, from the samples with exploration noise."""
     return [
-        {"run": one.run.name, "arm": one.trial.arm, "seed": one.trial.seed, **row}
-        for one in finished
-        for row in tables.read(one.run, "iterations", list(ITERATION_COLUMNS)).sort_by("iteration").to_pylist()
+        {"run": outcome.run.name, "arm": outcome.trial.arm, "seed": outcome.trial.seed, **row}
+        for outcome in finished
+        for row in tables.read(outcome.run, "iterations", list(ITERATION_COLUMNS)).sort_by("iteration").to_pylist()
     ]
 
 
@@ -109,14 +109,14 @@ def condition_rows(finished: Sequence[Finished]) -> list[Row]:
     """One row per run and condition, the run's own world first."""
     return [
         {
-            "run": one.run.name,
-            "arm": one.trial.arm,
-            "seed": one.trial.seed,
+            "run": outcome.run.name,
+            "arm": outcome.trial.arm,
+            "seed": outcome.trial.seed,
             "condition": condition,
             **{key: result.get(key, {}).get("mean") for key in EVALUATED},
         }
-        for one in finished
-        for condition, result in {"as trained": one.evaluation, **one.conditions}.items()
+        for outcome in finished
+        for condition, result in {"as trained": outcome.evaluation, **outcome.conditions}.items()
     ]
 
 
@@ -130,9 +130,9 @@ def condition_table(finished: Sequence[Finished]) -> str:
         "|---|---|---|---|---|",
     ]
     for (arm, condition), rows in groups.items():
-        own = spread_of(rows)
+        spread = spread_of(rows)
         cells = (("forward_speed_m_per_s", 3, 1), ("stuck_share_by_distance", 1, 100), ("cost", 3, 1))
-        lines.append(f"| {arm} | {condition} | {' | '.join(_spread(own, *cell) for cell in cells)} |")
+        lines.append(f"| {arm} | {condition} | {' | '.join(_spread(spread, *cell) for cell in cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -193,9 +193,9 @@ def _page(
     arms: Sequence[Row],
     pictures: Sequence[Path],
 ) -> str:
-    trials = [one.trial for one in finished]
-    wall_s = sum(one.origin["wall_s"] for one in finished)
-    commits = sorted({found for one in finished for found in one.origin["commits"]})
+    trials = [outcome.trial for outcome in finished]
+    wall_s = sum(outcome.origin.wall_s for outcome in finished)
+    commits = sorted({commit for outcome in finished for commit in outcome.origin.commits})
     seeds = sorted({trial.seed for trial in trials})
     evaluation_n = trials[0].config.run.evaluation_episodes
     return "\n".join(
@@ -224,7 +224,7 @@ def _page(
             "",
             "Each is an ordinary run that `t6gps show`, `query` and `render` open; these commands make the same data:",
             "",
-            *(f"    {shlex.join(train_command(trial))}" for trial in trials if trial.declared.peer is None),
+            *(f"    {shlex.join(train_command(trial))}" for trial in trials if trial.declared.baseline is None),
             "",
         ]
     )

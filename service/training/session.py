@@ -6,7 +6,6 @@ import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from enum import StrEnum
-from pathlib import Path
 from typing import TYPE_CHECKING
 
 from t6gps.service import config as configuration
@@ -15,7 +14,7 @@ from t6gps.service.execution.executor import Executor
 from t6gps.service.pool.state import RunState
 from t6gps.service.training import evaluation, loop
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.service.views import terminal
+from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import PhysicsError, RunError, TerrainError
@@ -32,7 +31,7 @@ class Engine(StrEnum):
     MUJOCO = "mujoco"
 
 
-def start_executor(config: Config, serial: bool, this: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
+def start_executor(config: Config, serial: bool, run: Run | None = None, engine: Engine = Engine.BULLET) -> Executor:
     """Workers and learner: on Ray, or in this process when `serial` or with another engine; of the run that trains.
 
     PhysicsError or TerrainError for a world that no worker can start in.
@@ -44,11 +43,11 @@ def start_executor(config: Config, serial: bool, this: Run | None = None, engine
     if serial or engine is Engine.MUJOCO:
         from t6gps.service.execution.serial import SerialExecutor
 
-        executor = SerialExecutor(config, this, _simulation(engine))
+        executor = SerialExecutor(config, run, _simulation(engine))
     else:
         from t6gps.service.execution.ray_executor import RayExecutor
 
-        executor = RayExecutor(config, this)
+        executor = RayExecutor(config, run)
     _heed_sigterm()
     return executor
 
@@ -68,56 +67,48 @@ def _simulation(engine: Engine) -> Callable[[RobotSettings], physics.Engine]:
     return PyBulletEngine
 
 
-def check_unchanged(this: Run, config: Config, remedy: str) -> None:
+def check_unchanged(run: Run, config: Config, remedy: str) -> None:
     """RunError with all differences if the run was created with another configuration (workers aside)."""
-    stored = configuration.parse(this.config_path.read_text())
+    stored = configuration.parse(run.config_path.read_text())
     changed = configuration.differences(stored, config)
     if changed:
-        raise RunError(f"run {this.name} has another configuration: {'; '.join(changed)}; {remedy}")
+        raise RunError(f"run {run.name} has another configuration: {'; '.join(changed)}; {remedy}")
 
 
-def complete(config: Config, this: Run, serial: bool) -> tuple[Evaluation, list[Path]]:
-    """Train what is missing of a run, evaluate its policy without noise, keep the result and draw the run's figures.
+def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
+    """Train what is missing of a run, evaluate its policy without noise, and keep the result.
 
-    Returns the evaluation and the pictures. Everything sampled is kept when KeyboardInterrupt comes. A run is removed
-    whose first executor cannot start.
+    Everything sampled is kept when KeyboardInterrupt comes. A run is removed whose first executor cannot start.
     """
-    from t6gps.service.views import run_figures
-
-    with catalog.locked(this):
+    with catalog.locked(run):
         try:
-            started = start_executor(config, serial, this)
+            started = start_executor(config, serial, run)
         except (RunError, PhysicsError, TerrainError):
-            catalog.discard_unused(this)
+            catalog.discard_unused(run)
             raise
         with closing(started) as executor:
-            with terminal.ProgressDisplay(config.run.iterations) as progress:
-                loop.train(config, this, executor, progress)
-            result = evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+            loop.train(config, run, executor, observer)
+            size = config.run
+            result = evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
             executor.close(RunState.DONE)
         _heed_sigterm()
-        evaluation.keep(this, result)
-        return result, run_figures.draw(this, config.terrain)
+        evaluation.keep(run, result)
+        return result
 
 
-def evaluate_newest(this: Run, overrides: Sequence[str], serial: bool) -> Evaluation:
+def evaluate_newest(run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:
     """Evaluate a run's newest policy in the world that `overrides` change, on the seeds of the run's own evaluation."""
-    config = configuration.parse(this.config_path.read_text(), overrides)
-    with closing(restored(config, this, serial)) as executor:
-        return evaluated(config, executor, config.run.evaluation_episodes, config.run.seed, None)
+    config = configuration.parse(run.config_path.read_text(), overrides)
+    with closing(restored(config, run, serial)) as executor:
+        size = config.run
+        return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
 
 
-def restored(config: Config, this: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
+def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
     """An executor whose learner is that of the run's newest checkpoint. RunError if there is none yet."""
-    latest = checkpoint.load_latest(this.checkpoints)
+    latest = checkpoint.load_latest(run.checkpoints)
     if latest is None:
-        raise RunError(f"run {this.name} has no checkpoint yet; let it finish an iteration")
+        raise RunError(f"run {run.name} has no checkpoint yet; let it finish an iteration")
     executor = start_executor(config, serial, engine=engine)
     executor.learner.restore(*latest[1:])
     return executor
-
-
-def evaluated(config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None) -> Evaluation:
-    """Evaluate the executor's policy under a progress bar."""
-    with terminal.ProgressDisplay(config.run.iterations) as progress:
-        return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, progress)

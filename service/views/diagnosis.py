@@ -4,9 +4,37 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from typing import Any
+from typing import TypedDict
 
-Rows = Sequence[dict[str, Any]]
+
+class IterationRow(TypedDict):
+    """What the diagnosis reads of a row of `iterations`; None where the run is older than the column."""
+
+    iteration: int
+    policy_version: int
+    cost: float
+    cost_standard_error: float
+    forward_speed_m_per_s: float
+    stuck_share: float
+    modes: float
+    predicted_cost_change: float
+    supervised_loss_before: float | None
+    supervised_loss: float
+    policy_kl: float | None
+    saturated_share: float | None
+
+
+class ClassRow(TypedDict):
+    """What the diagnosis reads of a row of `classes`."""
+
+    iteration: int
+    rows: int
+    time_steps: int
+    pooled: bool
+
+
+Iterations = Sequence[IterationRow]
+Classes = Sequence[ClassRow]
 
 # Healthy runs of flat-quick, from which the limits keep a distance: 11 to 22 % of the rows in pools, at most 5 % of the
 # commands saturated, at most 3 % of the time stuck, 1.1 to 1.4 modes from the second iteration on.
@@ -24,7 +52,7 @@ MODES, ROWS_PER_STEP = 1.05, 250
 """A second mode needs twice as many outliers as regressors (126 of them for `nodes`), in bins twice that large."""
 
 
-def diagnose(iterations: Rows, classes: Rows) -> list[str]:
+def diagnose(iterations: Iterations, classes: Classes) -> list[str]:
     """Sentences on a run with these rows of `iterations`, in any order and at least one, and of `classes`.
 
     Findings about learning compare iterations; the others concern the newest one. Columns that are null because the
@@ -34,19 +62,19 @@ def diagnose(iterations: Rows, classes: Rows) -> list[str]:
     newest = ordered[-1]
     if len(ordered) == 1:
         return ["Only the untrained policy has sampled so far; the next iteration shows what was learned from it."]
-    own = [row for row in classes if row["iteration"] == newest["iteration"]]
-    findings = [
+    present = [row for row in classes if row["iteration"] == newest["iteration"]]
+    findings = (
         _step_too_large(ordered),
         _promise_not_kept(ordered),
         _standing_still(newest),
         _saturated(newest),
         _loss_not_falling(newest),
-        _starved(own),
-        _too_few_samples_for_modes(newest, own),
-    ]
-    found = [finding for finding in findings if finding]
-    if found:
-        return found
+        _starved(present),
+        _too_few_samples_for_modes(newest, present),
+    )
+    sentences = [finding for finding in findings if finding]
+    if sentences:
+        return sentences
     first = ordered[0]
     return [
         f"All well: the cost fell from {first['cost']:.3f} to {newest['cost']:.3f} m2/s2 in {len(ordered)} iterations "
@@ -55,13 +83,13 @@ def diagnose(iterations: Rows, classes: Rows) -> list[str]:
     ]
 
 
-def _origins(ordered: Rows) -> dict[int, dict[str, Any]]:
+def _origins(ordered: Iterations) -> dict[int, IterationRow]:
     """By iteration, the one that its policy was learned from: the one before it, or in a pipelined run before that."""
     by_number = {row["iteration"]: row for row in ordered}
     return {row["iteration"]: by_number[row["policy_version"] - 1] for row in ordered if row["policy_version"] > 0}
 
 
-def _step_too_large(ordered: Rows) -> str | None:
+def _step_too_large(ordered: Iterations) -> str | None:
     rises, origins = [], _origins(ordered)
     for after in ordered:
         before = origins.get(after["iteration"])
@@ -73,7 +101,7 @@ def _step_too_large(ordered: Rows) -> str | None:
             rises.append((rise, before, after))
     if not rises:
         return None
-    _, before, after = max(rises, key=lambda found: found[0])
+    _, before, after = max(rises, key=lambda rise: rise[0])
     kl = "" if before["policy_kl"] is None else f", and moved the policy by {before['policy_kl']:.2f} nat"
     return (
         f"The step was too large: after iteration {before['iteration']} the cost rose from {before['cost']:.3f} to "
@@ -82,7 +110,7 @@ def _step_too_large(ordered: Rows) -> str | None:
     )
 
 
-def _promise_not_kept(ordered: Rows) -> str | None:
+def _promise_not_kept(ordered: Iterations) -> str | None:
     origins, end = _origins(ordered), ordered[-1]
     middle = origins.get(end["iteration"])
     start = middle and origins.get(middle["iteration"])
@@ -99,7 +127,7 @@ def _promise_not_kept(ordered: Rows) -> str | None:
     )
 
 
-def _standing_still(newest: dict[str, Any]) -> str | None:
+def _standing_still(newest: IterationRow) -> str | None:
     speed, stuck = newest["forward_speed_m_per_s"], newest["stuck_share"]
     if speed >= STANDING_SPEED_M_PER_S and stuck <= STUCK_SHARE:
         return None
@@ -110,7 +138,7 @@ def _standing_still(newest: dict[str, Any]) -> str | None:
     )
 
 
-def _saturated(newest: dict[str, Any]) -> str | None:
+def _saturated(newest: IterationRow) -> str | None:
     share = newest["saturated_share"]
     if share is None or share <= SATURATED_SHARE:
         return None
@@ -120,7 +148,7 @@ def _saturated(newest: dict[str, Any]) -> str | None:
     )
 
 
-def _loss_not_falling(newest: dict[str, Any]) -> str | None:
+def _loss_not_falling(newest: IterationRow) -> str | None:
     before, after = newest["supervised_loss_before"], newest["supervised_loss"]
     if before is None or after <= LOSS_LEFT * before:
         return None
@@ -130,7 +158,7 @@ def _loss_not_falling(newest: dict[str, Any]) -> str | None:
     )
 
 
-def _starved(classes: Rows) -> str | None:
+def _starved(classes: Classes) -> str | None:
     rows = sum(row["rows"] for row in classes)
     pooled = sum(row["rows"] for row in classes if row["pooled"])
     if not rows or pooled <= POOLED_SHARE * rows:
@@ -141,11 +169,11 @@ def _starved(classes: Rows) -> str | None:
     )
 
 
-def _too_few_samples_for_modes(newest: dict[str, Any], classes: Rows) -> str | None:
-    own = [row for row in classes if not row["pooled"]]
-    if not own or newest["modes"] > MODES:
+def _too_few_samples_for_modes(newest: IterationRow, classes: Classes) -> str | None:
+    alone = [row for row in classes if not row["pooled"]]
+    if not alone or newest["modes"] > MODES:
         return None
-    rows_per_step = sum(row["rows"] for row in own) / sum(row["time_steps"] for row in own)
+    rows_per_step = sum(row["rows"] for row in alone) / sum(row["time_steps"] for row in alone)
     if rows_per_step >= ROWS_PER_STEP:
         return None
     return (

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
+from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
 import numpy as np
 import pyarrow as pa
@@ -27,6 +29,9 @@ from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
 from t6gps.workers.robot.topology import DELTA, FACES, LAMBDA
 from t6gps.workers.settings import TerrainSettings
 
+if TYPE_CHECKING:
+    from matplotlib.typing import RcKeyType
+
 Array = NDArray[np.float64]
 ClassName = tuple[int, int | None, int | None]
 """Kind of the support triangle, canonical entry edge, canonical exit edge; None where a segment is partial."""
@@ -34,7 +39,8 @@ ClassName = tuple[int, int | None, int | None]
 BLUE, ORANGE, GREEN, RED, PURPLE, SKY = "#0072B2", "#E69F00", "#009E73", "#D55E00", "#CC79A7", "#56B4E9"
 """Colours that stay apart for colour-blind readers (Okabe and Ito)."""
 GREY, LIGHT, DARK = "#9A9A9A", "#C8C8C8", "#333333"
-STYLE: Any = {
+DOTS_PER_INCH = 160
+STYLE: dict[RcKeyType, object] = {
     "font.size": 10,
     "axes.titlesize": 11,
     "axes.titleweight": "bold",
@@ -47,7 +53,7 @@ STYLE: Any = {
     "axes.axisbelow": True,
     "legend.frameon": False,
     "lines.linewidth": 1.8,
-    "savefig.dpi": 160,
+    "savefig.dpi": DOTS_PER_INCH,
 }
 CLASS_COLOURS: dict[ClassName, str] = {
     (DELTA, 0, 0): PURPLE,
@@ -93,7 +99,7 @@ def save(figure: Figure, path: Path) -> Path:
 
 
 def canvas(width: float, height: float) -> Figure:
-    return Figure(figsize=(width, height), dpi=STYLE["savefig.dpi"], layout="constrained")
+    return Figure(figsize=(width, height), dpi=DOTS_PER_INCH, layout="constrained")
 
 
 def numbers(table: pa.Table, name: str) -> Array:
@@ -153,19 +159,19 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: TerrainSettings
         axes.plot(*path[-1], color=RED, marker="o", markeredgecolor="white", markersize=7, zorder=6)
         axes.set_title(f"Centre of mass, episode {typical['episode_id']}: {typical[SPEED]:+.2f} m/s forward")
         axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-        dot: Any = {"marker": "o", "markersize": 10, "linestyle": "", "markeredgecolor": DARK}
+        dot = partial(Line2D, [], [], marker="o", markersize=10, linestyle="", markeredgecolor=DARK)
         labels = {str(line.get_label()): line for line in axes.get_lines()}
         handles = {label: line for label, line in labels.items() if not label.startswith("_")}
-        handles["start"] = Line2D([], [], color=GREY, alpha=0.6, **dot)
-        handles["waypoint"] = Line2D([], [], color="white", **dot)
+        handles["start"] = dot(color=GREY, alpha=0.6)
+        handles["waypoint"] = dot(color="white")
         figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4)
     return figure
 
 
-def _ground(episode: dict[str, Any]) -> tuple[int, float] | None:
+def _ground(episode: Mapping[str, float]) -> tuple[int, float] | None:
     """What the ground of an episode depends on; None when it is flat."""
     difficulty = episode["terrain_difficulty"]
-    return (episode["terrain_seed"], difficulty) if difficulty > 0 else None
+    return (int(episode["terrain_seed"]), difficulty) if difficulty > 0 else None
 
 
 def _track(frames: pa.Table, episode_id: int) -> tuple[Array, Array]:

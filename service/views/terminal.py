@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import sys
-from collections.abc import Callable, Iterator, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from types import TracebackType
 from typing import Any
 
@@ -25,10 +25,19 @@ from rich.progress import (
 from rich.table import Table
 
 from t6gps.service.training.evaluation import EVALUATED, Evaluation
-from t6gps.service.training.loop import PHASE_TITLES
 
 console = Console(stderr=True)
 """Progress and messages go to stderr, results to stdout, so that results can be piped."""
+
+PHASE_TITLES = {
+    "sample": "sampling",
+    "segment": "segmenting",
+    "fit": "fitting",
+    "backward_pass": "backward pass",
+    "supervise": "supervised step",
+    "evaluate": "evaluation",
+}
+"""What the bar of each phase says."""
 
 LEARNING_COLUMNS = {
     "iteration": ("iteration", "{:d}"),
@@ -76,6 +85,11 @@ ARM_COLUMNS = {
 }
 
 
+def say(sentence: str, style: str | None = None) -> None:
+    """Print a message as it is, on one line however wide the terminal."""
+    console.print(sentence, style=style, highlight=False, soft_wrap=True, markup=False)
+
+
 class ProgressDisplay:
     """Shows a bar per phase of the current iteration and one line per finished iteration."""
 
@@ -107,13 +121,11 @@ class ProgressDisplay:
             if iteration == row["iteration"]:
                 self._progress.remove_task(self._tasks.pop((iteration, phase)))
         learning_s = sum(row[key] for key in ("segmenting_s", "fitting_s", "backward_pass_s", "supervised_s"))
-        self._progress.console.print(
+        say(
             f"iteration {row['iteration']}: "
             f"cost {row['cost']:.3f} +- {row['cost_standard_error']:.3f}, "
             f"forward {row['forward_speed_m_per_s']:.3f} +- {row['forward_speed_standard_error']:.3f} m/s, "
-            f"sampled in {row['sampling_s']:.1f} s, learned in {learning_s:.1f} s",
-            highlight=False,
-            soft_wrap=True,
+            f"sampled in {row['sampling_s']:.1f} s, learned in {learning_s:.1f} s"
         )
 
 
@@ -125,11 +137,31 @@ def task(title: str) -> Iterator[Callable[[int, int], None]]:
         yield lambda done, total: progress.update(bar, completed=done, total=total)
 
 
+class StudyDisplay:
+    """Shows how far a study is: its sentences, and the bars of the run at work."""
+
+    def say(self, sentence: str) -> None:
+        """Print a sentence."""
+        say(sentence)
+
+    def warn(self, sentence: str) -> None:
+        """Print a warning."""
+        say(f"warning: {sentence}", style="yellow")
+
+    def run(self, iterations: int) -> ProgressDisplay:
+        """The bars of a run that is trained or evaluated."""
+        return ProgressDisplay(iterations)
+
+    def task(self, title: str) -> AbstractContextManager[Callable[[int, int], None]]:
+        """A single bar; gives the function that moves it."""
+        return task(title)
+
+
 def _columns() -> tuple[ProgressColumn, ...]:
     return TextColumn("{task.description:<34}"), BarColumn(), MofNCompleteColumn(), TimeElapsedColumn()
 
 
-def print_rows(title: str, rows: Sequence[dict[str, Any]], columns: dict[str, tuple[str, str]]) -> None:
+def print_rows(title: str, rows: Sequence[Mapping[str, object]], columns: Mapping[str, tuple[str, str]]) -> None:
     """Print chosen columns of rows; a missing value is shown as '-'."""
     table = Table(title=title, title_justify="left")
     for heading, _ in columns.values():
@@ -176,7 +208,7 @@ def _distinct(names: Sequence[str]) -> list[str]:
     return distinct
 
 
-def _finite(value: Any) -> Any:
+def _finite(value: object) -> object:
     """JSON has no numbers beside the finite ones: the others become null."""
     if isinstance(value, dict):
         return {key: _finite(item) for key, item in value.items()}

@@ -97,6 +97,9 @@ def test_a_file_is_read_and_a_broken_one_refused(tmp_path: Path) -> None:
     assert load(str(good)).run.episodes == 7
     with pytest.raises(ConfigError, match="is not TOML"):
         load(str(broken))
+    broken.write_text("[run]\nseed = 2026-01-01\n")
+    with pytest.raises(ConfigError, match="date is not JSON serializable; use numbers, strings, booleans and lists"):
+        load(str(broken))
     with pytest.raises(ConfigError, match="cannot read"):
         load(str(tmp_path / "missing.toml"))
 

@@ -46,11 +46,11 @@ def root(tmp_path_factory: pytest.TempPathFactory) -> Path:
 
 
 def test_a_finished_run_has_data_checkpoints_and_figures(root: Path) -> None:
-    this = catalog.open_run(root, "tiny")
-    assert tables.committed_iterations(this) == 2
-    assert tables.read(this, "frames").num_rows == 2 * 3 * 31
-    assert len(list(this.checkpoints.glob("iteration-*"))) == 2
-    assert {path.name for path in this.figures.glob("*.png")} >= {"learning.png", "ground_track.png", "segments.png"}
+    run = catalog.open_run(root, "tiny")
+    assert tables.committed_iterations(run) == 2
+    assert tables.read(run, "frames").num_rows == 2 * 3 * 31
+    assert len(list(run.checkpoints.glob("iteration-*"))) == 2
+    assert {path.name for path in run.figures.glob("*.png")} >= {"learning.png", "ground_track.png", "segments.png"}
 
 
 def test_eval_prints_the_named_keys_as_json(root: Path) -> None:

@@ -11,6 +11,7 @@ import ray
 from t6gps.service.config import Config
 from t6gps.service.ray_backend import cluster
 from t6gps.service.training import session
+from t6gps.service.views.terminal import ProgressDisplay
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 
@@ -37,5 +38,5 @@ def test_a_run_whose_cluster_is_not_there_leaves_nothing_behind(
     monkeypatch.setenv("RAY_ADDRESS", "head")
     this = catalog.create(tmp_path, "one", Config().to_json())
     with pytest.raises(RunError, match="RAY_ADDRESS"):
-        session.complete(Config(), this, serial=False)
+        session.complete(Config(), this, False, ProgressDisplay(1))
     assert list(tmp_path.iterdir()) == []

@@ -4,9 +4,12 @@ from __future__ import annotations
 
 import csv
 import json
-from collections.abc import Sequence
-from dataclasses import replace
+import os
+from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
+from dataclasses import asdict, replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,8 +18,9 @@ from t6gps.service import config
 from t6gps.service.execution.serial import new_learner
 from t6gps.service.studies import arm_figures, baselines, conduct, declared, ground_figures, report
 from t6gps.service.studies.conduct import Finished, Trial
-from t6gps.service.studies.declared import PAPER, STUDIES, Arm, Peer, Scale, Study
-from t6gps.service.training import evaluation, session
+from t6gps.service.studies.declared import PAPER, STUDIES, Arm, Baseline, Scale, Study
+from t6gps.service.studies.origin import FILE, Origin, origin, recorded
+from t6gps.service.training import evaluation
 from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.schema import OBSERVATION_N
@@ -55,8 +59,42 @@ PAIR = Study(
 )
 
 
-def conducted(root: Path, planned: Sequence[Trial]) -> list[Finished]:
-    return conduct.conduct(planned, root, "pair", PAIR.conditions, serial=True)
+class Listener:
+    """Watches a study, keeps what it says, and counts the runs that it trains or evaluates."""
+
+    def __init__(self, stop_at: str = "") -> None:
+        self.sentences: list[str] = []
+        self.warnings: list[str] = []
+        self.runs_n = 0
+        self._stop_at = stop_at
+
+    def say(self, sentence: str) -> None:
+        self.sentences.append(sentence)
+
+    def warn(self, sentence: str) -> None:
+        self.warnings.append(sentence)
+
+    def run(self, iterations: int) -> AbstractContextManager[Listener]:
+        assert iterations > 0
+        self.runs_n += 1
+        return nullcontext(self)
+
+    def task(self, title: str) -> AbstractContextManager[Callable[[int, int], None]]:
+        assert title.startswith("training ")
+        return nullcontext(lambda done, total: None)
+
+    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
+        if phase == self._stop_at:
+            raise KeyboardInterrupt
+
+    def finished(self, row: dict[str, Any]) -> None:
+        assert row["episodes"] == 4
+
+
+def conducted(
+    root: Path, planned: Sequence[Trial], watcher: Listener | None = None, present: str | None = None
+) -> list[Finished]:
+    return conduct.conduct(planned, root, "pair", PAIR.conditions, True, watcher or Listener(), present)
 
 
 @pytest.fixture(scope="module")
@@ -77,7 +115,7 @@ def test_every_study_expands_to_each_arm_with_each_seed(name: str, scale: Scale)
         catalog.check_name(trial.name)
         assert trial.config.run.seed == trial.seed
     assert len({trial.name for trial in planned}) == len(planned)
-    assert len({(trial.declared.peer, trial.config.model_dump_json()) for trial in planned}) == len(planned)
+    assert len({(trial.declared.baseline, trial.config.model_dump_json()) for trial in planned}) == len(planned)
 
 
 def test_arms_differ_from_their_preset_in_what_they_declare_alone() -> None:
@@ -105,12 +143,13 @@ def test_a_pattern_chooses_arms() -> None:
 def test_runs_of_a_study_are_ordinary_runs_with_their_origin(pair: tuple[Path, list[Finished]]) -> None:
     root, finished = pair
     assert [run.name for run in catalog.list_runs(root)] == ["pair-quick-long-0", "pair-quick-short-0"]
-    for one in finished:
-        assert tables.committed_iterations(one.run) == 1
-        assert evaluation.kept(one.run) == one.evaluation
-        assert one.origin["arm"] == one.trial.arm
-        assert one.origin["wall_s"] > 0
-        assert len(one.origin["commits"]) == 1
+    for outcome in finished:
+        assert tables.committed_iterations(outcome.run) == 1
+        assert evaluation.kept(outcome.run) == outcome.evaluation
+        assert outcome.origin.arm == outcome.trial.arm
+        assert outcome.origin.wall_s > 0
+        assert len(outcome.origin.commits) == 1
+        assert len(list(outcome.run.figures.glob("*.png"))) == 3
 
 
 def test_the_folder_holds_tables_figures_and_how_they_were_made(
@@ -123,44 +162,40 @@ def test_the_folder_holds_tables_figures_and_how_they_were_made(
     assert {file.stem for file in files if file.suffix == ".png"} == figures
     with (tmp_path / "out" / "table.csv").open() as file:
         rows = {row["arm"]: row for row in csv.DictReader(file)}
-    for one in finished:
-        mean = one.evaluation["forward_speed_m_per_s"]["mean"]
-        assert float(rows[one.trial.arm]["forward_speed_m_per_s"]) == pytest.approx(mean)
-        assert rows[one.trial.arm]["forward_speed_m_per_s_deviation"] == ""
+    for outcome in finished:
+        mean = outcome.evaluation["forward_speed_m_per_s"]["mean"]
+        assert float(rows[outcome.trial.arm]["forward_speed_m_per_s"]) == pytest.approx(mean)
+        assert rows[outcome.trial.arm]["forward_speed_m_per_s_deviation"] == ""
     page = (tmp_path / "out" / "README.md").read_text()
-    for words in (PAIR.question, "    t6gps study pair", "seeds 0", finished[0].origin["commits"][0], "wall time"):
+    for words in (PAIR.question, "    t6gps study pair", "seeds 0", finished[0].origin.commits[0], "wall time"):
         assert words in page
-    for one in finished:
-        assert f"t6gps train flat-quick --run {one.run.name} --set=" in page
+    for outcome in finished:
+        assert f"t6gps train flat-quick --run {outcome.run.name} --set=" in page
 
 
-def test_a_study_run_again_skips_what_is_finished(
-    pair: tuple[Path, list[Finished]], monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_study_run_again_skips_what_is_finished(pair: tuple[Path, list[Finished]]) -> None:
     root, finished = pair
-    monkeypatch.setattr(session, "complete", None)  # nothing may be trained
-    again = conducted(root, conduct.trials("pair", PAIR, Scale.QUICK))
-    assert [one.evaluation for one in again] == [one.evaluation for one in finished]
+    watcher = Listener()
+    again = conducted(root, conduct.trials("pair", PAIR, Scale.QUICK), watcher)
+    assert watcher.runs_n == 0
+    assert watcher.sentences == [
+        "2 runs, 2 of them finished, 0 evaluations under other conditions to come: about 0 s on two idle cores"
+    ]
+    assert again == finished
 
 
-def test_a_stopped_study_goes_on_with_the_unfinished_run(
-    pair: tuple[Path, list[Finished]], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+def test_a_stopped_study_resumes_the_unfinished_run(pair: tuple[Path, list[Finished]], tmp_path: Path) -> None:
     _, finished = pair
     planned = conduct.trials("pair", PAIR, Scale.QUICK)
-    with monkeypatch.context() as patched, pytest.raises(KeyboardInterrupt):
-        patched.setattr(evaluation, "keep", _interrupted)
-        conducted(tmp_path, planned)
-    this = catalog.open_run(tmp_path, "pair-quick-short-0")
-    assert tables.committed_iterations(this) == 1
-    before = conduct.origin(this)["wall_s"]
+    with pytest.raises(KeyboardInterrupt):
+        conducted(tmp_path, planned, Listener(stop_at="evaluate"))
+    run = catalog.open_run(tmp_path, "pair-quick-short-0")
+    assert tables.committed_iterations(run) == 1
+    assert evaluation.kept(run) is None
+    before_s = origin(run).wall_s
     resumed = conducted(tmp_path, planned)
-    assert [one.evaluation for one in resumed] == [one.evaluation for one in finished]
-    assert conduct.origin(this)["wall_s"] > before
-
-
-def _interrupted(*_: object) -> None:
-    raise KeyboardInterrupt
+    assert [outcome.evaluation for outcome in resumed] == [outcome.evaluation for outcome in finished]
+    assert origin(run).wall_s > before_s
 
 
 def test_runs_of_another_configuration_are_refused(pair: tuple[Path, list[Finished]]) -> None:
@@ -170,15 +205,25 @@ def test_runs_of_another_configuration_are_refused(pair: tuple[Path, list[Finish
         conducted(root, planned)
 
 
-def test_runs_of_another_commit_are_kept_with_a_warning(
-    pair: tuple[Path, list[Finished]], monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
-) -> None:
+def test_runs_of_another_commit_are_kept_with_a_warning(pair: tuple[Path, list[Finished]]) -> None:
     root, finished = pair
-    monkeypatch.setattr(conduct, "commit", lambda: "another")
-    conducted(root, conduct.trials("pair", PAIR, Scale.QUICK))
-    told = capsys.readouterr().err
-    assert f"run pair-quick-long-0 comes from commit {finished[0].origin['commits'][0]}, this is another" in told
-    assert json.loads((finished[0].run.path / conduct.ORIGIN).read_text()) == finished[0].origin
+    watcher = Listener()
+    conducted(root, conduct.trials("pair", PAIR, Scale.QUICK), watcher, present="another")
+    began = f"run pair-quick-long-0 comes from commit {finished[0].origin.commits[0]}, this is another"
+    assert any(warning.startswith(began) for warning in watcher.warnings)
+    record = json.loads((finished[0].run.path / FILE).read_text())
+    assert record == asdict(finished[0].origin) | {"commits": list(finished[0].origin.commits)}
+
+
+def test_an_origin_adds_up_the_commits_and_the_time_of_each_part(tmp_path: Path) -> None:
+    run = catalog.create(tmp_path, "tried", config.load("flat-quick").to_json())
+    assert origin(run) == Origin()
+    for commit in ("a", "b", "a"):
+        with recorded(run, "pair", "short", 0, commit):
+            pass
+    with pytest.raises(KeyboardInterrupt), recorded(run, "pair", "short", 0, "c"):
+        raise KeyboardInterrupt
+    assert origin(run) == Origin("pair", "short", 0, ("a", "b", "c"), origin(run).wall_s, os.cpu_count())
 
 
 @pytest.mark.parametrize(
@@ -199,30 +244,28 @@ def test_an_unknown_study_is_refused() -> None:
         declared.find("horizont")
 
 
-@pytest.mark.parametrize("peer", Peer)
-def test_a_peer_is_evaluated_on_the_episodes_of_its_run_and_kept(
-    peer: Peer, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
-    monkeypatch.setattr(baselines, "PPO_OPTIONS", {"n_steps": 125, "batch_size": 125, "n_epochs": 1, "device": "cpu"})
-    one = Study(
+@pytest.mark.parametrize("baseline", Baseline)
+def test_a_baseline_is_evaluated_on_the_episodes_of_its_run_and_kept(baseline: Baseline, tmp_path: Path) -> None:
+    arm = Arm("baseline", "flat", "flat-quick", ("learner.value_from=0",), baseline=baseline)
+    study = Study(
         question="",
-        arms={"peer": Arm("peer", "flat", "flat-quick", ("learner.value_from=0",), peer=peer)},
+        arms={"baseline": arm},
         quick=("run.iterations=1", "run.episodes=5", "run.steps=250", "run.evaluation_episodes=2"),
         quick_seeds=1,
         figures=("conditions",),
         conditions={"one-way": ("task.directions=1", "run.steps=20")},
     )
-    planned = conduct.trials("peers", one, Scale.QUICK)
-    first = conduct.conduct(planned, tmp_path, "peers", one.conditions, serial=True)
-    again = conduct.conduct(planned, tmp_path, "peers", one.conditions, serial=True)
+    planned = conduct.trials("baselines", study, Scale.QUICK)
+    first = conduct.conduct(planned, tmp_path, "baselines", study.conditions, True, Listener())
+    again = conduct.conduct(planned, tmp_path, "baselines", study.conditions, True, Listener())
     assert first == again
     assert first[0].evaluation["episodes"] == 2
     assert first[0].evaluation["forward_speed_m_per_s"]["standard_error"] > 0
     assert first[0].conditions["one-way"]["forward_speed_m_per_s"]["standard_error"] == 0
-    assert report.arm_rows(first)[0]["steps"] == (0 if peer is Peer.FLOP else 1250)
-    files = report.write(tmp_path / "out", "peers", one, ["t6gps", "study", "peers"], first)
+    assert report.arm_rows(first)[0]["steps"] == (0 if baseline is Baseline.FLOP else 1250)
+    files = report.write(tmp_path / "out", "baselines", study, ["t6gps", "study", "baselines"], first)
     assert {file.stem for file in files if file.suffix == ".png"} == {"evaluations", "conditions"}
-    assert "| peer | one-way |" in (tmp_path / "out" / "README.md").read_text()
+    assert "| baseline | one-way |" in (tmp_path / "out" / "README.md").read_text()
 
 
 def test_the_workers_command_what_ppo_commands_on_average() -> None:

@@ -27,11 +27,11 @@ def iterations(costs: tuple[float, ...] = COSTS, **newest: Any) -> list[dict[str
 
 def classes(pooled_rows: int = 150, time_steps: int = 8) -> list[dict[str, Any]]:
     """Two classes of the newest iteration, and one of an earlier one that must not count."""
-    own = {"iteration": 3, "rows": 850, "time_steps": time_steps, "pooled": False}
+    frequent = {"iteration": 3, "rows": 850, "time_steps": time_steps, "pooled": False}
     return [
-        own,
-        own | {"rows": pooled_rows, "pooled": True},
-        own | {"iteration": 2, "rows": 10**6, "pooled": True},
+        frequent,
+        frequent | {"rows": pooled_rows, "pooled": True},
+        frequent | {"iteration": 2, "rows": 10**6, "pooled": True},
     ]
 
 

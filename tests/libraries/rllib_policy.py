@@ -5,21 +5,23 @@ from __future__ import annotations
 from typing import Any
 
 import torch
+from planned_environment import Actor, PlannedEnvironment
 from ray.rllib.algorithms.ppo import PPOConfig
 from ray.rllib.core.columns import Columns
 from ray.rllib.core.rl_module.rl_module import RLModuleSpec
 from ray.rllib.core.rl_module.torch import TorchRLModule
 
 from t6gps.service.bench.contenders import Job
-from t6gps.service.bench.libraries import FRAGMENTS_UNDER_WAY_N, Actor, PlannedEnvironment
+
+FRAGMENTS_UNDER_WAY_N = 2
 
 
 class ActorModule(TorchRLModule):
     """A module that learns nothing and acts like the job's policy."""
 
     def setup(self) -> None:
-        given: Any = self.model_config
-        self._actor = Actor(given["job"])
+        settings: Any = self.model_config
+        self._actor = Actor(settings["job"])
 
     def _forward(self, batch: dict[str, Any], **_: Any) -> dict[str, Any]:
         return {Columns.ACTIONS: torch.from_numpy(self._actor(batch[Columns.OBS].numpy()))}

@@ -1,32 +1,21 @@
-"""The same jobs through two libraries. Both step and observe the same episodes; neither records nor keeps them.
-
-    async_vector_env   Gymnasium's AsyncVectorEnv: this process acts for all environments, which step together
-    rllib              RLlib's EnvRunnerGroup: each runner acts and sends back fragments as long as an episode, two of
-                       them under way; the policy is that of all the others, in place of a torch network
-
-Raises ModuleNotFoundError on import, or from `rllib`, where the library is not installed.
-"""
+"""The robot in the episodes of a job, as an environment of Gymnasium, and the job's policy for its observations."""
 
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import gymnasium
 import numpy as np
-from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from gymnasium.wrappers import TimeLimit
 from numpy.typing import NDArray
 
 from t6gps.service.bench.contenders import Job
-from t6gps.service.bench.tally import Tally
 from t6gps.workers.environment import SuperBallEnvironment
 from t6gps.workers.episode import exploration, policy
 from t6gps.workers.settings import RobotSettings
 
 Floats = NDArray[np.float32]
-FRAGMENTS_UNDER_WAY_N = 2
 
 
 class PlannedEnvironment(gymnasium.Wrapper[Floats, Floats, Floats, Floats]):
@@ -71,40 +60,3 @@ class Actor:
     def __call__(self, observations: Floats) -> Floats:
         commands = np.array([self._act(observation) for observation in np.ascontiguousarray(observations)])
         return ((commands - self._middle_m) / self._half_range_m).astype(np.float32)
-
-
-def async_vector_env(job: Job) -> Tally:
-    """Gymnasium's AsyncVectorEnv with one environment per process."""
-    makers = [partial(PlannedEnvironment, job, first) for first in range(job.workers)]
-    environments = AsyncVectorEnv(makers, context="spawn", autoreset_mode=AutoresetMode.SAME_STEP)
-    tally, act = Tally(job.seconds), Actor(job)
-    try:
-        observations, _ = environments.reset()
-        while not tally.add(job.workers):
-            observations = environments.step(act(observations))[0]
-    finally:
-        environments.close()
-    return tally
-
-
-def rllib(job: Job) -> Tally:
-    """RLlib's EnvRunnerGroup, asked as IMPALA asks it."""
-    import ray
-    from ray.rllib.env.env_runner_group import EnvRunnerGroup
-
-    from t6gps.service.bench.rllib_policy import runner_settings
-    from t6gps.service.ray_backend.cluster import join_or_start
-
-    join_or_start(job.config)
-    try:
-        runners = EnvRunnerGroup(config=runner_settings(job), local_env_runner=False)
-        tally = Tally(job.seconds)
-        while not tally.is_over:
-            ready: list[Any] = runners.foreach_env_runner_async_fetch_ready(
-                func="sample", tag="sample", timeout_seconds=1.0
-            )
-            for episodes in ready:
-                tally.add(sum(len(episode) for episode in episodes))
-        return tally
-    finally:
-        ray.shutdown()

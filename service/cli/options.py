@@ -1,0 +1,45 @@
+"""Arguments and options that several commands share."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import typer
+
+from t6gps.storage.errors import ConfigError
+
+DEFAULT_ROOT = Path("runs")
+
+Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
+RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
+Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
+Overrides = Annotated[
+    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
+]
+Serial = Annotated[bool, typer.Option("--serial", help="Run in this process, without Ray; same data.")]
+Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers (changes the speed only).")]
+Autoscale = Annotated[
+    str | None, typer.Option("--autoscale", metavar="MIN:MAX", help="Keep workers between, by backlog and free CPUs.")
+]
+
+
+def check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, ...], reason: str) -> None:
+    """ConfigError for an override whose key starts with nothing that is allowed."""
+    for override in overrides or []:
+        if not override.startswith(allowed):
+            raise ConfigError(
+                f"{command} cannot change {override.partition('=')[0]}: {reason}; "
+                f"allowed: keys that start with {', '.join(allowed)}"
+            )
+
+
+def with_workers(overrides: list[str] | None, workers: int | None, autoscale: str | None = None) -> list[str]:
+    """The overrides, and those that --workers and --autoscale stand for. ConfigError unless it is MIN:MAX."""
+    settings = [] if workers is None else [f"run.workers={workers}"]
+    if autoscale is not None:
+        least, colon, most = autoscale.partition(":")
+        if not (colon and least.isdecimal() and most.isdecimal()):
+            raise ConfigError(f"--autoscale takes MIN:MAX, found '{autoscale}'; for example --autoscale 1:8")
+        settings += [f"run.workers_min={least}", f"run.workers_max={most}"]
+    return (overrides or []) + settings

@@ -1,0 +1,162 @@
+"""The commands that read what is stored: `runs`, `show`, `query`, `render`, and `export`, which needs no run."""
+
+from __future__ import annotations
+
+import shlex
+from collections.abc import Sequence
+from enum import StrEnum
+from pathlib import Path
+from typing import Annotated
+
+import pyarrow.compute as pc
+import typer
+
+from t6gps.service import config as configuration
+from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, check_keys
+from t6gps.service.training import evaluation
+from t6gps.service.views import terminal
+from t6gps.service.views.diagnosis import diagnose
+from t6gps.storage import catalog, tables
+from t6gps.storage import query as sql_query
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError, RunError
+
+EXPORT_SECTIONS = ("robot.", "terrain.")
+
+
+class ExportFormat(StrEnum):
+    """Formats in which the robot leaves."""
+
+    MJCF = "mjcf"
+
+
+class QueryFormat(StrEnum):
+    """Formats of a query's result."""
+
+    TABLE = "table"
+    CSV = "csv"
+    JSON = "json"
+    ARROW = "arrow"
+
+
+def add_to(app: typer.Typer) -> None:
+    """Make the commands part of `t6gps`."""
+    for command in (runs, show, query, render, export):
+        app.command()(command)
+
+
+def runs(root: Root = DEFAULT_ROOT) -> None:
+    """List the runs."""
+    if not root.is_dir():
+        raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
+    rows = []
+    for run in catalog.list_runs(root):
+        last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
+        done = len(last) and last[0]["iteration"] + 1
+        planned = configuration.parse(run.config_path.read_text()).run.iterations
+        rows.append(
+            {
+                "run": run.name,
+                "iterations": f"{done} of {planned}",
+                "cost": last[0]["cost"] if last else None,
+                "forward_speed_m_per_s": last[0]["forward_speed_m_per_s"] if last else None,
+            }
+        )
+    columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
+    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
+    terminal.print_rows(f"Runs in {root}", rows, columns)
+
+
+def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
+    """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
+    run = catalog.open_run(root, run_name)
+    if not tables.committed_iterations(run):
+        typer.echo(f"run {run_name} has not finished an iteration yet")
+        return
+    print_learning(run)
+    classes = tables.read(run, "classes").to_pylist()
+    last = max((row["iteration"] for row in classes), default=-1)
+    rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
+    terminal.print_rows(f"Segment classes of iteration {last}", rows, terminal.CLASS_COLUMNS)
+    iterations = tables.read(run, "iterations").to_pylist()
+    typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
+    result = evaluation.kept(run)
+    if result:
+        terminal.print_evaluation(result)
+    print_paths(run, sorted(run.figures.glob("*.png")), root)
+
+
+def query(
+    run_name: RunName,
+    sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT over frames, episodes, iterations, classes.")],
+    root: Root = DEFAULT_ROOT,
+    form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
+) -> None:
+    """Query a run's stored trajectories with SQL."""
+    terminal.write_table(sql_query.query(catalog.open_run(root, run_name), sql), form.value)
+
+
+def render(
+    run_name: RunName,
+    episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
+    out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
+    root: Root = DEFAULT_ROOT,
+    step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
+    strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
+) -> None:
+    """Draw a stored episode from its recorded states: a still, a strip of snapshots, or a film."""
+    from t6gps.workers.ground.ground import ground
+    from t6gps.workers.pictures import render as rendering
+
+    run = catalog.open_run(root, run_name)
+    frames = tables.episode_frames(run, episode)
+    row = tables.read(run, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
+    config = configuration.parse(run.config_path.read_text())
+    terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+    with terminal.task("rendering") as progress:
+        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress)
+    typer.echo(out)
+
+
+def export(
+    form: Annotated[ExportFormat, typer.Argument(metavar="mjcf", help="MuJoCo's model format.")],
+    out: Annotated[Path, typer.Argument(metavar="FILE.xml", help="File to write.")],
+    terrain_seed: Annotated[int, typer.Option(min=0, help="Seed of rough ground (--set terrain.difficulty=1).")] = 0,
+    root: Root = DEFAULT_ROOT,
+    overrides: Overrides = None,
+) -> None:
+    """Write the robot and its ground as a model for other tools."""
+    from t6gps.workers.ground.ground import ground
+    from t6gps.workers.physics.mjcf import to_mjcf
+
+    check_keys(overrides, f"export {form.value}", EXPORT_SECTIONS, "the model has only a robot and its ground")
+    config = configuration.parse("{}", overrides or [], "--set")
+    text = to_mjcf(config.robot, ground(config.terrain, terrain_seed, config.terrain.difficulty))
+    try:
+        out.write_text(text)
+    except OSError as error:
+        raise ConfigError(f"cannot write {out}: {error.strerror}; name a file in an existing folder") from None
+    typer.echo(out)
+
+
+def print_learning(run: Run) -> None:
+    """Print the learning curve of a run."""
+    rows = tables.read(run, "iterations").sort_by("iteration").to_pylist()
+    terminal.print_rows(f"Run {run.name}", rows, terminal.LEARNING_COLUMNS)
+
+
+def print_paths(run: Run, pictures: Sequence[Path], root: Path) -> None:
+    """Print where a run's files lie, and commands to try next."""
+    place = f" --root {shlex.quote(str(root))}" if root != DEFAULT_ROOT else ""
+    lines = [
+        f"dataset      {run.tables}",
+        f"checkpoints  {run.checkpoints}",
+        *(f"figure       {picture}" for picture in pictures),
+        "",
+        "Try next:",
+        f"  t6gps eval {run.name} --episodes 40 --seed 7{place}",
+        f'  t6gps query {run.name} "SELECT iteration, avg(forward_speed_m_per_s) AS m_per_s FROM episodes '
+        f'GROUP BY iteration ORDER BY iteration"{place}',
+        f"  t6gps render {run.name} 0 --out episode.mp4{place}",
+    ]
+    typer.echo("\n".join(lines))

@@ -1,0 +1,48 @@
+"""Where a figure or a file comes from: the commit, the date, the machine and the versions of the libraries."""
+
+from __future__ import annotations
+
+import os
+import platform
+import subprocess
+from dataclasses import dataclass
+from datetime import UTC, datetime
+from importlib import metadata
+from pathlib import Path
+
+PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "ray")
+"""Those on which the data of an episode depend."""
+
+
+@dataclass(frozen=True)
+class Provenance:
+    """What made a measurement, and when: the date is UTC in ISO 8601."""
+
+    commit: str
+    date: str
+    platform: str
+    cores: int
+    versions: dict[str, str]
+
+
+def provenance() -> Provenance:
+    """Of what this process makes now."""
+    now = datetime.now(UTC).isoformat(timespec="seconds")
+    return Provenance(commit(), now, platform.platform(), os.cpu_count() or 1, versions())
+
+
+def commit() -> str:
+    """The checked-out commit, or the version of an installed package."""
+    folder = Path(__file__).parent
+    git = subprocess.run(
+        ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"],
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    return git.stdout.strip() if git.returncode == 0 else metadata.version("t6gps")
+
+
+def versions() -> dict[str, str]:
+    """Versions of PACKAGES and of Python, by name."""
+    return {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()}

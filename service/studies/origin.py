@@ -1,0 +1,59 @@
+"""Where a study's run comes from, in a file beside its tables: study, arm and seed, commits, and the time they took."""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import asdict, dataclass
+
+from t6gps.storage import durable
+from t6gps.storage.catalog import Run
+
+FILE = "origin.json"
+
+
+@dataclass(frozen=True)
+class Origin:
+    """A study's run: its place in the study, the commits that worked on it, their seconds, the cores of the machine.
+
+    Study, arm, seed and cores are None where no study has worked on the run.
+    """
+
+    study: str | None = None
+    arm: str | None = None
+    seed: int | None = None
+    commits: tuple[str, ...] = ()
+    wall_s: float = 0.0
+    cores: int | None = None
+
+
+def origin(run: Run) -> Origin:
+    """The origin of a run, as its file has it."""
+    path = run.path / FILE
+    if not path.exists():
+        return Origin()
+    record = json.loads(path.read_text())
+    return Origin(**record | {"commits": tuple(record["commits"])})
+
+
+@contextmanager
+def recorded(run: Run, study: str, arm: str, seed: int, commit: str) -> Iterator[None]:
+    """Add the commit and the time of what runs inside to the run's origin, also when it is interrupted."""
+    before, start = origin(run), time.perf_counter()
+    commits = before.commits if commit in before.commits else (*before.commits, commit)
+
+    def keep() -> None:
+        wall_s = round(before.wall_s + time.perf_counter() - start, 1)
+        record = Origin(study, arm, seed, commits, wall_s, os.cpu_count())
+        path = run.path / FILE
+        durable.hidden(path).write_text(json.dumps(asdict(record), indent=2) + "\n")
+        durable.publish(path)
+
+    keep()
+    try:
+        yield
+    finally:
+        keep()
