@@ -113,6 +113,8 @@ class Pool:
         if self.state.condition is not RunState.FAILED:
             self.state.turn(condition, reason)
         self._control.publish(self.status())
+        if self._log is not None:
+            self._log.close()
 
     def wait(self, who: str, whom: str, begins: bool) -> None:
         """Note that somebody begins or ends to wait for somebody."""

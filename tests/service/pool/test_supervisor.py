@@ -470,6 +470,15 @@ def test_what_was_decided_under_faults_is_decided_again_from_the_log(tmp_path: P
     assert replay(tmp_path / "decisions.jsonl") > 100
 
 
+def test_a_recorded_failure_is_decided_again() -> None:
+    """Real workers were killed, hung and failed (tests/faults/record.py); today's supervisor decides the same."""
+    recorded = Path(__file__).with_name("recorded_failure.jsonl")
+    assert replay(recorded) > 50
+    text = recorded.read_text()
+    for sign in ('"why":"hung"', '"why":"crashed"', '"blameless":true', '"kind":"raised"', '"kind":"Quarantine"'):
+        assert sign in text
+
+
 def test_a_log_that_has_grown_large_begins_anew_with_the_state_and_is_replayed_from_there(tmp_path: Path) -> None:
     log = DecisionLog(tmp_path, largest_bytes=20_000)
     house = House(2, 60, autoscale=(1, 3), log=log)
