@@ -33,7 +33,7 @@ from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.state import Identity, PoolState, RunState, WorkerId
 from t6gps.service.ray_backend.cluster import join_or_start, this_node
 from t6gps.service.ray_backend.transport import Call, RayTransport, Remote
-from t6gps.service.ray_backend.worker_actor import Answer, Greeting
+from t6gps.service.ray_backend.worker_actor import Answer, Started
 from t6gps.storage import ipc
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.storage.spool import Spool
@@ -55,10 +55,10 @@ class SlotsActor:
         self._whole = stub.episode(job.plans[0], job.snapshot)
         self._turns: dict[int, asyncio.Lock] = {}
 
-    async def open(self, slot: int) -> Greeting:
+    async def open(self, slot: int) -> Started:
         """Make a slot; as WorkerActor.open, but with no process to end with it."""
         self._turns[slot] = asyncio.Lock()
-        return Greeting(Identity(os.getpid(), socket.gethostname(), this_node(), ""), None)
+        return Started(Identity(os.getpid(), socket.gethostname(), this_node(), ""), None)
 
     async def ping(self) -> None:
         """A sign of life."""

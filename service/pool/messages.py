@@ -72,15 +72,15 @@ class Died:
 
 
 @dataclass(frozen=True)
-class Remains:
+class PostMortem:
     """What could be learned of a worker from outside before it was killed.
 
-    blameless   somebody else ended or stopped it, or its node is gone: it is not the episode's fault
+    episode_at_fault   False when somebody else ended or stopped the worker, or its node is gone
     """
 
     stacks: str = ""
     log: str = ""
-    blameless: bool = False
+    episode_at_fault: bool = True
 
 
 @dataclass(frozen=True)
@@ -88,7 +88,7 @@ class Ended:
     """A worker was ended as instructed."""
 
     worker: WorkerId
-    remains: Remains
+    post_mortem: PostMortem
 
 
 @dataclass(frozen=True)

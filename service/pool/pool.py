@@ -22,9 +22,9 @@ from t6gps.service.pool.messages import (
     Observation,
     Opened,
     Ping,
+    PostMortem,
     Publish,
     Quarantine,
-    Remains,
     Sampled,
     ScaleRequested,
     Send,
@@ -165,9 +165,9 @@ class Pool:
                 self._transport.ping(instruction.worker)
             case End():
                 drained = instruction.why is Ending.DRAINED
-                remains = Remains() if drained else self._transport.examine(instruction.worker)
+                post_mortem = PostMortem() if drained else self._transport.examine(instruction.worker)
                 self._transport.kill(instruction.worker)
-                self._unseen.append(Ended(instruction.worker, remains))
+                self._unseen.append(Ended(instruction.worker, post_mortem))
             case AskCapacity():
                 waiting = tuple(worker for worker in instruction.starting if not self._transport.placed(worker))
                 self._unseen.append(Capacity(self._transport.free_workers(), waiting))

@@ -26,10 +26,10 @@ from t6gps.service.pool.messages import (
     Observation,
     Opened,
     Ping,
+    PostMortem,
     Publish,
     Quarantine,
     Ready,
-    Remains,
     Sampled,
     ScaleRequested,
     Send,
@@ -56,7 +56,7 @@ def decide(state: PoolState, observed: Sequence[Observation], now: float) -> lis
     for step in (_end_overdue, _drain, _fill, _send):
         instructions += step(state, now)
     before = state.condition, state.reason
-    _judge(state)
+    _update_condition(state)
     if (state.condition, state.reason) != before:
         instructions.append(Publish(state.condition, state.reason))
     return instructions
@@ -76,7 +76,7 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
         case ScaleRequested():
             state.wanted, state.autoscale = observation.workers, None  # scaled by hand: it stays so
         case Ended():
-            yield from _on_ended(state, observation.worker, observation.remains)
+            yield from _on_ended(state, observation.worker, observation.post_mortem)
         case _:
             worker = state.worker(observation.worker)
             if worker is not None:
@@ -163,7 +163,7 @@ def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str =
     return End(worker.id, why)
 
 
-def _on_ended(state: PoolState, worker_id: WorkerId, remains: Remains) -> Iterator[Instruction]:
+def _on_ended(state: PoolState, worker_id: WorkerId, post_mortem: PostMortem) -> Iterator[Instruction]:
     """The worker is gone: blame the episode in hand if it is at fault, and give back the others."""
     worker = state.workers.pop(worker_id.slot)
     assert worker.id == worker_id and worker.ending is not None, "only a worker that is to end is ended"
@@ -171,9 +171,9 @@ def _on_ended(state: PoolState, worker_id: WorkerId, remains: Remains) -> Iterat
     if why is not Ending.DRAINED and worker.plans:
         plan = worker.plans[0]
         kind = FailureKind.HANG if why is Ending.HANG else FailureKind.CRASH
-        kind = FailureKind.LOST if remains.blameless else kind
+        kind = kind if post_mortem.episode_at_fault else FailureKind.LOST
         where = f"{worker.id}" + (f", process {worker.identity.pid}" if worker.identity else "")
-        failure = Failure(kind, error, message, plan.seed, None, remains.stacks, [], where, remains.log)
+        failure = Failure(kind, error, message, plan.seed, None, post_mortem.stacks, [], where, post_mortem.log)
         yield from _record_failure(state, plan, failure)
     state.ledger.give_back(*worker_id)
 
@@ -252,7 +252,7 @@ def _credit(state: PoolState) -> bool:
     return under_way < min(PLANS_PER_WORKER * max(len(state.workers), 1), most_bytes_n)
 
 
-def _judge(state: PoolState) -> None:
+def _update_condition(state: PoolState) -> None:
     """Condition and reason, in words."""
     if state.condition is RunState.FAILED:
         return

@@ -6,7 +6,7 @@ from abc import ABC, abstractmethod
 from dataclasses import dataclass
 
 from t6gps.service.pool.attempt import Failure
-from t6gps.service.pool.messages import Alive, Died, Ready, Remains
+from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
 from t6gps.service.pool.state import WorkerId
 from t6gps.storage.records import Episode, EpisodePlan
 
@@ -44,7 +44,7 @@ class Transport(ABC):
         """Everything reported since the last call, waiting up to `wait_s` for a first report."""
 
     @abstractmethod
-    def examine(self, worker: WorkerId) -> Remains:
+    def examine(self, worker: WorkerId) -> PostMortem:
         """Look at a worker that hangs or has died, from outside, in less than half a second."""
 
     @abstractmethod

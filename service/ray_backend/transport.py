@@ -16,7 +16,7 @@ import ray
 
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.deadlines import Timings
-from t6gps.service.pool.messages import Alive, Died, Ready, Remains
+from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
 from t6gps.service.pool.state import WorkerId
 from t6gps.service.pool.transport import Done, Report, Transport
 from t6gps.service.ray_backend import cluster, node_agent, private, processes
@@ -24,7 +24,7 @@ from t6gps.service.ray_backend.cluster import start_actor
 from t6gps.service.ray_backend.node_agent import NodeAgentActor
 from t6gps.service.ray_backend.policy_server import PolicyServer
 from t6gps.service.ray_backend.processes import Process
-from t6gps.service.ray_backend.worker_actor import Answer, Greeting, MakeWorker, WorkerActor
+from t6gps.service.ray_backend.worker_actor import Answer, MakeWorker, Started, WorkerActor
 from t6gps.storage import ipc
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.settings import RolloutSettings
@@ -121,15 +121,15 @@ class RayTransport(Transport):
             return Died(worker, type(error).__name__, how)
         if isinstance(result, Answer):
             return self._done(call, result)
-        if isinstance(result, Greeting):
+        if isinstance(result, Started):
             return self._ready(worker, remote, result)
         return Alive(worker)
 
-    def _ready(self, worker: WorkerId, remote: Remote, greeting: Greeting) -> Ready:
-        remote.process, remote.node = greeting.process, greeting.identity.node_id
+    def _ready(self, worker: WorkerId, remote: Remote, started: Started) -> Ready:
+        remote.process, remote.node = started.process, started.identity.node_id
         if remote.node != self._node and remote.node not in self._agents:
             self._agents[remote.node] = start_actor(NodeAgentActor, where=remote.node)
-        return Ready(worker, greeting.identity)
+        return Ready(worker, started.identity)
 
     def _done(self, call: Call, answer: Answer) -> Done:
         assert call.plan is not None, "only plans have answers"
@@ -141,27 +141,27 @@ class RayTransport(Transport):
             self.policies.missed(answer.silent_server)
         return Done(call.worker, call.plan, result, answer.policy_digest)
 
-    def examine(self, worker: WorkerId) -> Remains:
+    def examine(self, worker: WorkerId) -> PostMortem:
         remote = self._remotes[worker]
         if remote.process is None:
-            return Remains("the process was never ready")
+            return PostMortem("the process was never ready")
         if remote.node == self._node:
-            remains = node_agent.remains(remote.process, self._logs, remote.died)
+            post_mortem = node_agent.post_mortem(remote.process, self._logs, remote.died)
         else:
-            remains = self._examine_there(remote.process, remote.node, remote.died)
-        return replace(remains, blameless=remains.blameless and not remote.exited)
+            post_mortem = self._examine_there(remote.process, remote.node, remote.died)
+        return replace(post_mortem, episode_at_fault=post_mortem.episode_at_fault or remote.exited)
 
-    def _examine_there(self, process: Process, node: str, died: bool) -> Remains:
+    def _examine_there(self, process: Process, node: str, died: bool) -> PostMortem:
         if node in self._agents:
             try:
                 asked = self._agents[node].examine.remote(process, died)
-                remains: Remains = ray.get(asked, timeout=self._timings.examine_s)
-                return remains
+                post_mortem: PostMortem = ray.get(asked, timeout=self._timings.examine_s)
+                return post_mortem
             except ray.exceptions.ActorDiedError:
                 del self._agents[node]  # the next worker that is ready there brings another
             except ray.exceptions.RayError as error:
                 _log.info("the agent of node %s does not answer: %s", node, type(error).__name__)
-        return Remains(f"its node does not answer ({node})", blameless=True)
+        return PostMortem(f"its node does not answer ({node})", episode_at_fault=False)
 
     def kill(self, worker: WorkerId) -> None:
         remote = self._remotes.pop(worker)

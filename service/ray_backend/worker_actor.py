@@ -26,7 +26,7 @@ VAIN_PULL_S = 0.2
 
 
 @dataclass(frozen=True)
-class Greeting:
+class Started:
     """Who a worker is, and its process."""
 
     identity: Identity
@@ -56,12 +56,12 @@ class WorkerActor:
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
-    def open(self, make_worker: MakeWorker, settings: RolloutSettings) -> Greeting:
+    def open(self, make_worker: MakeWorker, settings: RolloutSettings) -> Started:
         """Make the worker."""
         self._worker = make_worker(settings)
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
         digest = settings_digest(settings.model_dump_json())
-        return Greeting(Identity(os.getpid(), address, cluster.this_node(), digest), self._process)
+        return Started(Identity(os.getpid(), address, cluster.this_node(), digest), self._process)
 
     def ping(self) -> None:
         """A sign of life."""

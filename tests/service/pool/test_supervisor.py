@@ -15,7 +15,7 @@ from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import FACTOR, TIMINGS, EpisodeTimes
 from t6gps.service.pool.decision_log import DecisionLog, replay
 from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.messages import Alive, Died, Ready, Remains
+from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
 from t6gps.service.pool.state import (
@@ -119,8 +119,8 @@ class Paper(Transport):
         reports, self.reports = self.reports, []
         return reports
 
-    def examine(self, worker: WorkerId) -> Remains:
-        return Remains(f"stacks of {worker}", "log")
+    def examine(self, worker: WorkerId) -> PostMortem:
+        return PostMortem(f"stacks of {worker}", "log")
 
     def kill(self, worker: WorkerId) -> None:
         self.alive.pop(worker, None)
@@ -475,7 +475,13 @@ def test_a_recorded_failure_is_decided_again() -> None:
     recorded = Path(__file__).with_name("recorded_failure.jsonl")
     assert replay(recorded) > 50
     text = recorded.read_text()
-    for sign in ('"why":"hung"', '"why":"crashed"', '"blameless":true', '"kind":"raised"', '"kind":"Quarantine"'):
+    for sign in (
+        '"why":"hung"',
+        '"why":"crashed"',
+        '"episode_at_fault":false',
+        '"kind":"raised"',
+        '"kind":"Quarantine"',
+    ):
         assert sign in text
 
 
