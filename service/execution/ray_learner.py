@@ -97,9 +97,10 @@ class RayLearner:
 
     def learn(self, phase: str) -> Iterator[tuple[int, int]]:
         """Run a phase; yields (done, total)."""
-        while self._taken:
-            self._answer(self._taken[-1])
-            self._taken.pop()
+        if self._taken:
+            self._until_done(self._taken[-1])
+            taken, self._taken = self._taken, []
+            self._value(taken)
         steps = self.actor.learn.options(num_returns="streaming").remote(phase)
         while True:
             self._until_done(steps)
@@ -133,6 +134,10 @@ class RayLearner:
 
     def _answer(self, reference: Any) -> Any:
         self._until_done(reference)
+        return self._value(reference)
+
+    def _value(self, reference: Any) -> Any:
+        """The value behind a reference, or values behind a list of them."""
         try:
             return _get(reference)
         except RunError as error:

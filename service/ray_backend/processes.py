@@ -104,6 +104,16 @@ def cpu_s(pid: int) -> float:
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
 
 
+def peak_mb(pid: int) -> float:
+    """Largest resident memory of a process (MB), shared memory and mapped files included; 0 when it has ended."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except (FileNotFoundError, ProcessLookupError):
+        return 0.0
+    _, _, rest = status.partition("VmHWM:")
+    return int(rest.split()[0]) / 1024 if rest else 0.0
+
+
 def fault_in(log: str) -> bool:
     """True when a process said in its log how it failed in C; Ray has every process do so."""
     return FAULT in log
