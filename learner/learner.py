@@ -19,11 +19,16 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, localization, lqg, policy, report, standard_gps, supervised, surrogate, value
-from t6gps.learner.features import Rows, read_rows
-from t6gps.learner.modes import FitOptions
+from t6gps.learner import cost, policy, report
+from t6gps.learner.algorithm import backward_pass as lqg
+from t6gps.learner.algorithm import local_models as surrogate
+from t6gps.learner.algorithm import supervised
+from t6gps.learner.algorithm.features import Rows, read_rows
+from t6gps.learner.algorithm.modes import FitOptions
+from t6gps.learner.algorithm.segments import cut, group
+from t6gps.learner.alternatives import localization, standard_gps
+from t6gps.learner.improvers import action_value as value
 from t6gps.learner.report import Fitted, Improved, Segmented, Trained, root_mean_square
-from t6gps.learner.segments import cut, group
 from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage import schema, tables
 from t6gps.storage.catalog import Run

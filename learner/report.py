@@ -8,9 +8,12 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg, supervised, surrogate, warping
-from t6gps.learner.features import NONE, Rows
-from t6gps.learner.segments import SegmentGroup, Segments
+from t6gps.learner import cost
+from t6gps.learner.algorithm import backward_pass as lqg
+from t6gps.learner.algorithm import local_models as surrogate
+from t6gps.learner.algorithm import supervised, warping
+from t6gps.learner.algorithm.features import NONE, Rows
+from t6gps.learner.algorithm.segments import SegmentGroup, Segments
 
 
 @dataclass(frozen=True)

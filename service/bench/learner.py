@@ -8,7 +8,7 @@ from contextlib import closing
 
 import pyarrow as pa
 
-from t6gps.learner import benchmarks
+from t6gps.learner.bench import speed as benchmarks
 from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.execution.executor import PHASES, Executor

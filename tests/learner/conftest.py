@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
 
-from t6gps.learner.features import Rows, read_rows
+from t6gps.learner.algorithm.features import Rows, read_rows
 from t6gps.learner.learner import Learner
 from t6gps.learner.policy import initial
 from t6gps.learner.settings import LearnerSettings

@@ -10,12 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import policy, surrogate
+from t6gps.learner import policy
+from t6gps.learner.algorithm import local_models as surrogate
+from t6gps.learner.algorithm.features import NONE, Rows, read_rows
+from t6gps.learner.algorithm.modes import FitOptions
+from t6gps.learner.algorithm.segments import cut, group
 from t6gps.learner.cost import running_cost
-from t6gps.learner.features import NONE, Rows, read_rows
 from t6gps.learner.learner import Learner
-from t6gps.learner.modes import FitOptions
-from t6gps.learner.segments import cut, group
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.storage import schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError

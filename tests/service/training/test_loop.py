@@ -7,7 +7,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from t6gps.learner import value
+from t6gps.learner.improvers import action_value as value
 from t6gps.service.config import Config, load
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.service.training import evaluation, loop

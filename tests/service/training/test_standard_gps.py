@@ -6,8 +6,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import standard_gps
-from t6gps.learner.features import NONE
+from t6gps.learner.algorithm.features import NONE
+from t6gps.learner.alternatives import standard_gps
 from t6gps.service import seeding
 from t6gps.service.config import Config, load
 from t6gps.service.execution.serial import SerialExecutor

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import torch
 
-from t6gps.learner import policy, supervised
+from t6gps.learner import policy
+from t6gps.learner.algorithm import supervised
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.records import PolicySnapshot
 

@@ -5,11 +5,11 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from t6gps.learner import localization, mixtures
-from t6gps.learner.features import Rows
-from t6gps.learner.modes import FitOptions, ModeSearch, fit_modes, moments
+from t6gps.learner.algorithm.features import Rows
+from t6gps.learner.algorithm.local_models import fit_class
+from t6gps.learner.algorithm.modes import FitOptions, ModeSearch, fit_modes, moments
+from t6gps.learner.alternatives import localization, mixtures
 from t6gps.learner.settings import Localization
-from t6gps.learner.surrogate import fit_class
 
 OPTIONS = FitOptions(modes=2, residual_threshold=0.35, prior_samples=50.0, ridge=1e-3)
 ALTERNATIVES = [Localization.KIND, Localization.NONE, Localization.CLUSTERS]

@@ -9,7 +9,8 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import benchmarks, modes
+from t6gps.learner.algorithm import modes
+from t6gps.learner.bench import speed as benchmarks
 from t6gps.learner.learner import Learner
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.errors import ConfigError, DataError

@@ -33,7 +33,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t6gps.learner import _backward
-from t6gps.learner.modes import Models
+from t6gps.learner.algorithm.modes import Models
 from t6gps.storage.errors import DataError
 
 Array = NDArray[np.floating]

@@ -9,9 +9,9 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import warping
-from t6gps.learner.features import NONE, Rows, read_rows
-from t6gps.learner.segments import ClassKey, cut, group
+from t6gps.learner.algorithm import warping
+from t6gps.learner.algorithm.features import NONE, Rows, read_rows
+from t6gps.learner.algorithm.segments import ClassKey, cut, group
 from t6gps.storage import schema
 from t6gps.storage.errors import DataError
 

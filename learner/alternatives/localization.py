@@ -11,10 +11,10 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner.features import NONE, Rows
-from t6gps.learner.modes import FitOptions, moments
+from t6gps.learner.algorithm.features import NONE, Rows
+from t6gps.learner.algorithm.local_models import FIT_STREAM, ClassJob
+from t6gps.learner.algorithm.modes import FitOptions, moments
 from t6gps.learner.settings import Localization
-from t6gps.learner.surrogate import FIT_STREAM, ClassJob
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]

@@ -8,10 +8,11 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg
-from t6gps.learner.benchmarks import plain_backward_pass
-from t6gps.learner.features import Rows
-from t6gps.learner.modes import Models
+from t6gps.learner import cost
+from t6gps.learner.algorithm import backward_pass as lqg
+from t6gps.learner.algorithm.features import Rows
+from t6gps.learner.algorithm.modes import Models
+from t6gps.learner.bench.speed import plain_backward_pass
 from t6gps.storage.errors import DataError
 
 NX, NU, T, B, C = 5, 3, 6, 4, 0.05

@@ -29,8 +29,9 @@ import pyarrow as pa
 import torch
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, policy, supervised
-from t6gps.learner.features import acting_rows
+from t6gps.learner import cost, policy
+from t6gps.learner.algorithm import supervised
+from t6gps.learner.algorithm.features import acting_rows
 from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
 

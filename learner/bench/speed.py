@@ -15,10 +15,13 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg, modes, surrogate
-from t6gps.learner.features import Rows, read_rows
+from t6gps.learner import cost
+from t6gps.learner.algorithm import backward_pass as lqg
+from t6gps.learner.algorithm import local_models as surrogate
+from t6gps.learner.algorithm import modes
+from t6gps.learner.algorithm.features import Rows, read_rows
+from t6gps.learner.algorithm.segments import cut, group
 from t6gps.learner.learner import CHUNK, Learner
-from t6gps.learner.segments import cut, group
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.errors import ConfigError, DataError
 

@@ -29,8 +29,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner import mixtures
-from t6gps.learner.features import VELOCITY_N
+from t6gps.learner.algorithm.features import VELOCITY_N
+from t6gps.learner.alternatives import mixtures
 from t6gps.learner.settings import ModeSearch
 
 Array = NDArray[np.float64]

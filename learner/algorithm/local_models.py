@@ -14,10 +14,10 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner import warping
-from t6gps.learner.features import NONE, Rows
-from t6gps.learner.modes import FitOptions, Models, Moments, fit_modes, moments, stack
-from t6gps.learner.segments import SegmentGroup, Segments
+from t6gps.learner.algorithm import warping
+from t6gps.learner.algorithm.features import NONE, Rows
+from t6gps.learner.algorithm.modes import FitOptions, Models, Moments, fit_modes, moments, stack
+from t6gps.learner.algorithm.segments import SegmentGroup, Segments
 
 Ints = NDArray[np.int64]
 

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from t6gps.learner.modes import FitOptions, Models, Moments, fit_modes, moments
+from t6gps.learner.algorithm.modes import FitOptions, Models, Moments, fit_modes, moments
 
 NX, NU = 6, 4
 ALONE = FitOptions(modes=4, residual_threshold=1.0, prior_samples=0.0, ridge=1e-9)

@@ -11,7 +11,8 @@ import pyarrow as pa
 import pytest
 import torch
 
-from t6gps.learner import policy, value
+from t6gps.learner import policy
+from t6gps.learner.improvers import action_value as value
 from t6gps.learner.learner import Learner
 from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage import schema

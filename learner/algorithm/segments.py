@@ -17,7 +17,7 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner.features import NONE, Rows
+from t6gps.learner.algorithm.features import NONE, Rows
 
 Ints = NDArray[np.int64]
 

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner.features import NONE, Rows, acting_rows
+from t6gps.learner.algorithm.features import NONE, Rows, acting_rows
 from t6gps.storage import schema
 
 Array = NDArray[np.float64]
