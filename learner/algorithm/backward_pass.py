@@ -1,4 +1,6 @@
-"""Backward pass of linear-quadratic-Gaussian control with a KL term (paper Sec. II-A, III-F; Algorithm 2, line 10).
+"""Backward pass of linear-quadratic-Gaussian control with a KL term (Sec. II-A, III-F).
+
+LQGBackwardPass, line 10 of Algorithm 2.
 
 Sub-trajectories of equal length T are solved in one call; the first axis is the sub-trajectory, the second is time.
 Everything is expressed in deviations around the recorded states x and actions u.
@@ -33,11 +35,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t6gps.learner import _backward
-from t6gps.learner.algorithm.modes import Models
+from t6gps.learner.algorithm.regression import Models
+from t6gps.learner.rows import Floats, Ints
 from t6gps.storage.errors import DataError
 
 Array = NDArray[np.floating]
-Ints = NDArray[np.int64]
 
 ACTION_VARIANCE_FLOOR_M2 = 1e-4
 """No policy counts as more certain than 1 cm per cable."""
@@ -53,9 +55,9 @@ class Improvement:
                             acts from the recorded first state on in the surrogate models [b, T] (m2/s2)
     """
 
-    K: NDArray[np.float32]
-    k: NDArray[np.float32]
-    predicted_cost_change: NDArray[np.float32]
+    K: Floats
+    k: Floats
+    predicted_cost_change: Floats
 
 
 @dataclass(frozen=True)
@@ -67,9 +69,9 @@ class LqgModels:
     R_inverse   S / c [k, nu];   P [k, nu, nx]
     """
 
-    F: NDArray[np.float32]
-    R_inverse: NDArray[np.float32]
-    P: NDArray[np.float32]
+    F: Floats
+    R_inverse: Floats
+    P: Floats
 
 
 def prepare(models: Models, kl_weight: float, variance_m2: float | None = None) -> LqgModels:
@@ -83,7 +85,7 @@ def prepare(models: Models, kl_weight: float, variance_m2: float | None = None) 
     return LqgModels(F, _single(np.maximum(fitted, ACTION_VARIANCE_FLOOR_M2) / kl_weight), _single(models.P))
 
 
-def _single(array: Array) -> NDArray[np.float32]:
+def _single(array: Array) -> Floats:
     return np.ascontiguousarray(array, dtype=np.float32)
 
 
@@ -97,7 +99,7 @@ def backward_pass(models: LqgModels, model: Ints, residual: Array, root: Array, 
     DataError where no gains exist, as with models that are not finite.
     """
     (count, length), (nu, nx) = model.shape, models.P.shape[1:]
-    found = Improvement(
+    improvement = Improvement(
         np.empty((count, length, nu, nx), dtype=np.float32),
         np.empty((count, length, nu), dtype=np.float32),
         np.empty((count, length), dtype=np.float32),
@@ -110,41 +112,27 @@ def backward_pass(models: LqgModels, model: Ints, residual: Array, root: Array, 
         _single(residual),
         _single(root),
         _single(deviation),
-        found.K,
-        found.k,
-        found.predicted_cost_change,
+        improvement.K,
+        improvement.k,
+        improvement.predicted_cost_change,
     )
     if failed >= 0:
         raise DataError(
             f"the backward pass cannot improve sub-trajectory {failed} of {count}: its models are not finite or too "
             "steep for single precision; use a larger learner.prior_samples or learner.kl_weight"
         )
-    return found
+    return improvement
 
 
-def predicted_change(F: Array, model: Ints, residual: Array, root: Array, change: Array) -> NDArray[np.float32]:
+def predicted_change(F: Array, model: Ints, residual: Array, root: Array, change: Array) -> Floats:
     """Change of the running cost after each step [b, T] (m2/s2) when actions change by `change` [b, T, nu].
 
     What models of slopes F [k, nx, nx + nu] promise of actions from elsewhere, as `Improvement` does of those of the
     backward pass; the other arguments are its own.
     """
-    dx, found = np.zeros((len(model), F.shape[1]), dtype=np.float32), np.empty(model.shape, dtype=np.float32)
+    dx, predicted = np.zeros((len(model), F.shape[1]), dtype=np.float32), np.empty(model.shape, dtype=np.float32)
     for step, chosen in enumerate(model.T):
         dx = np.einsum("bij,bj->bi", F[chosen], np.concatenate([dx, change[:, step]], axis=1))
         more = dx @ root.T
-        found[:, step] = np.einsum("bi,bi->b", more, residual[:, step] + more / 2)
-    return found
-
-
-def sub_trajectories(continues: NDArray[np.bool_], horizon_steps: int) -> dict[int, Ints]:
-    """First rows of all sub-trajectories by their length (paper Sec. III-F; GetSubTrajectories of Algorithm 2).
-
-    Runs of rows that lead to the next row [n] are divided into consecutive pieces of `horizon_steps`; the
-    last piece of a run may be shorter.
-    """
-    index = np.flatnonzero(continues)
-    run = np.cumsum(np.diff(index, prepend=-2) > 1)
-    age = np.arange(len(index)) - np.flatnonzero(np.diff(run, prepend=0))[run - 1]
-    begins = np.flatnonzero(age % horizon_steps == 0)
-    lengths = np.diff(begins, append=len(index))
-    return {int(length): index[begins[lengths == length]] for length in np.unique(lengths)}
+        predicted[:, step] = np.einsum("bi,bi->b", more, residual[:, step] + more / 2)
+    return predicted

@@ -1,5 +1,7 @@
 """Segmentation and classification of trajectories (paper Sec. III-A, IV-B; Algorithm 2, lines 3 to 5).
 
+SegmentSamples (line 3) is `cut`, one episode at a time; FilterSegments (lines 4 and 5) is `classify` and `group`.
+
 A segment is a run of rows [start, stop) on one support triangle. Its class is
 
     (kind, entry edge, exit edge, truncated)
@@ -11,15 +13,13 @@ last has the exit.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import NamedTuple
 
 import numpy as np
-from numpy.typing import NDArray
 
-from t6gps.learner.algorithm.features import NONE, Rows
-
-Ints = NDArray[np.int64]
+from t6gps.learner.rows import NONE, Flags, Ints, Rows
 
 
 class ClassKey(NamedTuple):
@@ -29,6 +29,19 @@ class ClassKey(NamedTuple):
     entry: int
     exit: int
     truncated: bool
+
+
+class Pieces(NamedTuple):
+    """Where segments lie [m]: first row and the row after the last; the first and the last piece of its stay.
+
+    rows_n   rows that they were cut from
+    """
+
+    start: Ints
+    stop: Ints
+    enters: Flags
+    leaves: Flags
+    rows_n: int
 
 
 @dataclass(frozen=True)
@@ -45,7 +58,7 @@ class Segments:
     kind: Ints
     entry: Ints
     exit: Ints
-    truncated: NDArray[np.bool_]
+    truncated: Flags
     of_row: Ints
 
     def key(self, segment: int) -> ClassKey:
@@ -70,44 +83,69 @@ class SegmentGroup:
     classes: dict[ClassKey, Ints]
 
 
-def cut(rows: Rows, longest_steps: int) -> Segments:
-    """Segments of `rows`: every row with an action lies in exactly one (paper Sec. III-A; IV-B, 3)."""
-    index = np.flatnonzero(rows.acts)
-    stay = np.cumsum(rows.starts[index])
+def cut(starts: Flags, acts: Flags, longest_steps: int) -> Pieces:
+    """Segments of rows [n]: every row that acts lies in exactly one (paper Sec. III-A; IV-B, 3).
+
+    `starts` says which rows are the first on their support triangle. What is cut from several episodes is what is cut
+    from each, since every episode starts with such a row.
+    """
+    index = np.flatnonzero(acts)
+    stay = np.cumsum(starts[index])
     first_of_stay = np.flatnonzero(np.diff(stay, prepend=0))
     age = np.arange(len(index)) - first_of_stay[stay - 1]
     begins = np.flatnonzero(age % longest_steps == 0)
-    ends = np.append(begins[1:], len(index)) - 1
-    last_of_stay = np.diff(stay, append=stay[-1] + 1)[ends] > 0
-    of_row = np.full(len(rows.acts), NONE)
-    of_row[index] = np.cumsum(age % longest_steps == 0) - 1
+    ends = np.append(begins[1:], len(index))[: len(begins)] - 1
+    leaves = np.diff(stay, append=len(index) + 1)[ends] > 0
+    return Pieces(index[begins], index[ends] + 1, age[begins] == 0, leaves, len(acts))
+
+
+def join(episodes: Sequence[Pieces]) -> Pieces:
+    """Segments of at least one episode, whose rows lie one under another."""
+    rows_n = np.array([pieces.rows_n for pieces in episodes])
+    segments_n = np.array([len(pieces.start) for pieces in episodes])
+    above = np.repeat(np.cumsum(rows_n) - rows_n, segments_n)
+    start, stop, enters, leaves, _ = zip(*episodes, strict=True)
+    return Pieces(
+        np.concatenate(start) + above,
+        np.concatenate(stop) + above,
+        np.concatenate(enters),
+        np.concatenate(leaves),
+        int(rows_n.sum()),
+    )
+
+
+def classify(rows: Rows, pieces: Pieces) -> Segments:
+    """Segments with the parts of their classes: the edges of a stay belong to its first and its last piece."""
+    start, stop = pieces.start, pieces.stop
+    of_row = np.full(pieces.rows_n, NONE)
+    of_row[rows.acts] = np.repeat(np.arange(len(start)), stop - start)
     return Segments(
-        start=index[begins],
-        stop=index[ends] + 1,
-        kind=rows.kind[index[begins]],
-        entry=np.where(age[begins] == 0, rows.entry[index[begins]], NONE),
-        exit=np.where(last_of_stay, rows.exit[index[ends]], NONE),
-        truncated=~last_of_stay,
+        start=start,
+        stop=stop,
+        kind=rows.kind[start],
+        entry=np.where(pieces.enters, rows.entry[start], NONE),
+        exit=np.where(pieces.leaves, rows.exit[stop - 1], NONE),
+        truncated=~pieces.leaves,
         of_row=of_row,
     )
 
 
 def group(segments: Segments, smallest_class_segments: int) -> list[SegmentGroup]:
-    """Groups in a fixed order; each segment lies in exactly one (Algorithm 2, lines 4 and 5).
+    """Groups in a fixed order; each segment lies in exactly one (FilterSegments of Algorithm 2, lines 4 and 5).
 
     Rare classes are pooled by exit as well as by kind: the exit fixes how labels and axes change with the
     crossing, so a pool over several exits would mix last steps that predict states in different frames.
     """
     columns = np.stack([segments.kind, segments.entry, segments.exit, segments.truncated])
     _, firsts, class_of = np.unique(columns, axis=1, return_index=True, return_inverse=True)
-    own, pools = [], dict[tuple[int, int], dict[ClassKey, Ints]]()
+    groups, pools = [], dict[tuple[int, int], dict[ClassKey, Ints]]()
     for number, first in enumerate(firsts):
         key, members = segments.key(int(first)), np.flatnonzero(class_of.ravel() == number)
         if len(members) >= smallest_class_segments:
-            own.append(SegmentGroup(key, False, members, {key: members}))
+            groups.append(SegmentGroup(key, False, members, {key: members}))
         else:
             pools.setdefault((key.kind, key.exit), {})[key] = members
     for (kind, exit_), classes in sorted(pools.items()):
         members = np.sort(np.concatenate(list(classes.values())))
-        own.append(SegmentGroup(ClassKey(kind, NONE, exit_, False), True, members, classes))
-    return own
+        groups.append(SegmentGroup(ClassKey(kind, NONE, exit_, False), True, members, classes))
+    return groups

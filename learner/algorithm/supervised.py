@@ -1,4 +1,6 @@
-"""S-step: training of the policy on observations and improved actions (paper Sec. II-A; Algorithm 2, line 13).
+"""S-step: training of the policy on observations and improved actions (Sec. II-A).
+
+SupervisedLearning, line 13 of Algorithm 2:
 
     minimise over theta   mean | network_theta(y) - (u* - offset) / scale |^2
 
@@ -9,15 +11,16 @@ a millisecond of many small products, in which two threads mostly wait for each 
 from __future__ import annotations
 
 import math
-from collections.abc import Generator
+from collections.abc import Callable, Generator
 from typing import NamedTuple
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 from torch.optim.adam import adam
 
 from t6gps.learner import policy
+from t6gps.learner.algorithm.pairs import Pairs, Several
+from t6gps.learner.rows import Ints
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.records import PolicySnapshot
 
@@ -66,33 +69,33 @@ class Loss(NamedTuple):
 
 
 def train(
-    snapshot: PolicySnapshot,
-    observations: NDArray[np.float32],
-    actions: NDArray[np.float32],
-    settings: LearnerSettings,
-    rng: np.random.Generator,
+    snapshot: PolicySnapshot, pairs: Pairs | Several, settings: LearnerSettings, rng: np.random.Generator
 ) -> Generator[tuple[int, int], None, tuple[PolicySnapshot, Loss]]:
-    """Train on observations [n, ny] and actions u* [n, nu] (m), n >= 1.
+    """Train on at least one pair of an observation [ny] and an action u* [nu] (m).
 
     Yields (epochs done, epochs) and returns the next policy version with its loss. The result is a function of the
     arguments alone.
     """
     torch.set_num_threads(1)
-    inputs = torch.from_numpy(observations)
-    targets = torch.from_numpy((actions - np.float32(snapshot.offset_m)) / np.float32(snapshot.scale_m))
+
+    def take(chosen: Ints) -> tuple[torch.Tensor, torch.Tensor]:
+        observations, actions = pairs.take(chosen)
+        targets = (actions - np.float32(snapshot.offset_m)) / np.float32(snapshot.scale_m)
+        return torch.from_numpy(observations), torch.from_numpy(targets)
+
     parameters, layers = policy.parameters(snapshot)
     moments = no_moments(parameters)
-    batches = -(-len(inputs) // settings.batch)
+    batches = -(-len(pairs) // settings.batch)
     steps = settings.epochs * batches
-    before = _mean_squared_error(layers, inputs, targets)
+    before = _mean_squared_error(layers, take, len(pairs))
     for epoch in range(settings.epochs):
-        order = torch.from_numpy(rng.permutation(len(inputs)))
-        for step, batch in enumerate(order.tensor_split(batches), epoch * batches):
+        order = rng.permutation(len(pairs))
+        for step, batch in enumerate(np.array_split(order, batches), epoch * batches):
             decay = (1 + math.cos(math.pi * step / steps)) / 2
-            change = gradient(layers, inputs[batch], targets[batch], len(batch))
+            change = gradient(layers, *take(batch), len(batch))
             descend(parameters, change, moments, settings.learning_rate * decay)
         yield epoch + 1, settings.epochs
-    loss = Loss(before, _mean_squared_error(layers, inputs, targets))
+    loss = Loss(before, _mean_squared_error(layers, take, len(pairs)))
     trained = tuple((weight.numpy().copy(), bias.numpy().copy()) for weight, bias in layers)
     return PolicySnapshot(snapshot.version + 1, trained, snapshot.offset_m, snapshot.scale_m), loss
 
@@ -112,10 +115,13 @@ def gradient(layers: policy.Layers, inputs: torch.Tensor, targets: torch.Tensor,
     return torch.cat(parts[::-1])
 
 
-def _mean_squared_error(layers: policy.Layers, inputs: torch.Tensor, targets: torch.Tensor) -> float:
-    total = 0.0
-    for first in range(0, len(inputs), policy.ROWS):
-        rows = slice(first, first + policy.ROWS)
-        error = policy.activations(layers, inputs[rows])[-1] - targets[rows]
+def _mean_squared_error(
+    layers: policy.Layers, take: Callable[[Ints], tuple[torch.Tensor, torch.Tensor]], pairs_n: int
+) -> float:
+    total, entries_n = 0.0, 0
+    for first in range(0, pairs_n, policy.ROWS):
+        inputs, targets = take(np.arange(first, min(first + policy.ROWS, pairs_n)))
+        error = policy.activations(layers, inputs)[-1] - targets
         total += float(error.square().sum(dtype=torch.float64))
-    return total / targets.numel()
+        entries_n += targets.numel()
+    return total / entries_n

@@ -1,4 +1,4 @@
-"""Time warping by uniform stretch (paper Sec. III-B).
+"""Time warping by uniform stretch (paper Sec. III-B; FitLocalModels, Algorithm 2, line 6).
 
 A class has T steps, the median length of its segments. Point a of a segment with n points belongs to
 
@@ -11,9 +11,8 @@ The last step then holds crossings alone; all other points stay at steps 0 .. T 
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
-Ints = NDArray[np.int64]
+from t6gps.learner.rows import Ints
 
 
 def class_steps(lengths: Ints, crosses: bool) -> int:

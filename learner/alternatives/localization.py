@@ -4,6 +4,8 @@ KIND       one model bin for the ordinary transitions of each kind of triangle, 
 NONE       one bin for everything
 CLUSTERS   the bins of KIND divided by k-means on the standardised reduced state, as Reset-Free GPS localises its
            samples (Montgomery et al. 2017): no time, no entry, no order
+
+They stand in the place of lines 4 and 5 of Algorithm 2.
 """
 
 from __future__ import annotations
@@ -11,42 +13,38 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner.algorithm.features import NONE, Rows
-from t6gps.learner.algorithm.local_models import FIT_STREAM, ClassJob
-from t6gps.learner.algorithm.modes import FitOptions, moments
+from t6gps.learner.algorithm.local_models import ClassPlan
+from t6gps.learner.algorithm.modes import FitOptions
+from t6gps.learner.algorithm.regression import pooled_moments
+from t6gps.learner.rows import NONE, Floats, Ints, Rows
 from t6gps.learner.settings import Localization
-
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from t6gps.learner.streams import Stream, branch, generator
 
 SAMPLES_PER_CLUSTER = 400
 """As many as a step of a common segment class holds."""
 LLOYD_ITERATIONS = 15
-CLUSTER_STREAM = 3
-"""Branch of the learner's seed sequence, after 0 fits, 1 S-step and 2 untrained policy."""
 
 
-def jobs(
+def plans(
     rows: Rows, localization: Localization, options: FitOptions, run_seed: int, iteration: int
-) -> dict[int, ClassJob]:
-    """Jobs of the bins, each of a single step; shrunk as the steps of classes are, towards the kind (and exit)."""
-    samples, index = rows.samples, np.flatnonzero(rows.continues)
+) -> dict[int, ClassPlan]:
+    """Plans of the bins, each of a single step; shrunk as the steps of classes are, towards the kind (and exit)."""
+    index = np.flatnonzero(rows.continues)
     pools = np.stack([rows.kind[index], rows.exit[index]], axis=1)
     if localization is Localization.NONE:
         pools[:] = NONE
-    rng = np.random.default_rng(np.random.SeedSequence(run_seed, spawn_key=(1, iteration, CLUSTER_STREAM)))
-    built: dict[int, ClassJob] = {}
+    rng = generator(run_seed, branch(iteration, Stream.CLUSTERS))
+    made: dict[int, ClassPlan] = {}
     for kind, exit_ in np.unique(pools, axis=0).tolist():
         pool = index[(pools == (kind, exit_)).all(axis=1)]
-        prior = moments(samples[pool].astype(np.float64))
+        prior = pooled_moments(rows, pool)
         clusters = np.zeros(len(pool), dtype=np.int64)
         if localization is Localization.CLUSTERS:
-            clusters = k_means(rows.state[pool].astype(np.float64), -(-len(pool) // SAMPLES_PER_CLUSTER), rng)
+            clusters = k_means(rows.state[pool], -(-len(pool) // SAMPLES_PER_CLUSTER), rng)
         for cluster in np.unique(clusters).tolist():
             chosen = pool[clusters == cluster]
-            built[len(built)] = ClassJob(
+            made[len(made)] = ClassPlan(
                 rows=chosen,
-                samples=samples[chosen],
                 state_n=rows.state.shape[1],
                 step=np.zeros(len(chosen), dtype=np.int64),
                 steps=1,
@@ -54,30 +52,26 @@ def jobs(
                 ordinary=prior,
                 crossing=None,
                 options=options,
-                entropy=run_seed,
-                branch=(1, iteration, FIT_STREAM, kind + 1, exit_ + 1, cluster),
+                run_seed=run_seed,
+                branch=branch(iteration, Stream.FITS, kind + 1, exit_ + 1, cluster),
             )
-    return built
+    return made
 
 
-def k_means(points: Array, clusters_n: int, rng: np.random.Generator) -> Ints:
-    """Cluster of each point [n] by Lloyd's algorithm on standardised coordinates, from random points as centres."""
-    spread = points.std(axis=0)
-    points = (points - points.mean(axis=0)) / np.where(spread > 0, spread, 1.0)
-    centres = points[rng.choice(len(points), min(clusters_n, len(points)), replace=False)]
-    nearest = _nearest(points, centres)
-    for _ in range(LLOYD_ITERATIONS):
-        counts = np.bincount(nearest, minlength=len(centres))
-        sums = np.zeros_like(centres)
-        np.add.at(sums, nearest, points)
-        centres = np.where(counts[:, None] > 0, sums / np.maximum(counts, 1)[:, None], centres)
-        moved, nearest = nearest, _nearest(points, centres)
-        if np.array_equal(moved, nearest):
-            break
-    return nearest
+def k_means(states: Floats, clusters_n: int, rng: np.random.Generator) -> Ints:
+    """Cluster of each state [n, nx] by scikit-learn's KMeans on standardised coordinates.
 
+    Centres begin at random states that the generator chooses. One thread: several add up in an order of their own.
+    """
+    from sklearn.cluster import KMeans
+    from threadpoolctl import threadpool_limits
 
-def _nearest(points: Array, centres: Array) -> Ints:
-    distances = np.einsum("ki,ki->k", centres, centres) - 2 * points @ centres.T
-    nearest: Ints = distances.argmin(axis=1)
-    return nearest
+    spread = states.std(axis=0, dtype=np.float64)
+    points: NDArray[np.float64] = (states - states.mean(axis=0, dtype=np.float64)) / np.where(spread > 0, spread, 1.0)
+    seed = int(rng.integers(2**31))
+    search = KMeans(
+        min(clusters_n, len(points)), init="random", n_init=1, max_iter=LLOYD_ITERATIONS, tol=0.0, random_state=seed
+    )
+    with threadpool_limits(limits=1):
+        labels: Ints = search.fit_predict(points).astype(np.int64)
+    return labels

@@ -2,23 +2,35 @@
 
     a ~ sum over h of  w_h Normal(m_h, C_h),        a = [x; u; x'] standardised
 
-by expectation maximisation. Covariances are shrunk towards the pooled one C as the fits are, so that components with
-fewer samples than entries stay definite.
+by scikit-learn's GaussianMixture. It knows no prior; in its place each C_h is widened in the units of the pooled
+covariance by
+
+    ridge + n0 / (n0 + n / k)        the weight that n0 samples of the pool have beside the n / k of a component,
+
+so that components with fewer samples than entries stay definite.
 """
 
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 
 import numpy as np
-from numpy.typing import NDArray
 
-Array = NDArray[np.float64]
-Ints = NDArray[np.int64]
+from t6gps.learner.algorithm.modes import FitOptions
+from t6gps.learner.algorithm.regression import Array, Bin, Mode, fit
+from t6gps.learner.rows import Ints
 
-EM_ITERATIONS = 20
-CONVERGED = 1e-4
-"""Largest change of a responsibility at which the iteration ends."""
+EM_ITERATIONS = 100
+SMALLEST_VARIANCE = 1e-12
+"""Of an entry that the pool does not vary in."""
+
+
+def gaussian(bin_: Bin, options: FitOptions, rng: np.random.Generator) -> list[Mode]:
+    """Modes from the components of a Gaussian mixture (in the place of `modes.ransac`)."""
+    shrinkage = bin_.shrinkage
+    found = components(bin_.a, bin_.pooled, options.modes, shrinkage.prior_samples, shrinkage.ridge, rng)
+    return [fit(bin_, chosen, len(chosen)) for chosen in found]
 
 
 def components(
@@ -28,34 +40,19 @@ def components(
 
     pooled [na, na] is the covariance that counts as `prior_samples` samples; `ridge` is added relative to its diagonal.
     """
+    from sklearn.exceptions import ConvergenceWarning
+    from sklearn.mixture import GaussianMixture
+    from threadpoolctl import threadpool_limits
+
     n, count = len(a), min(components_n, len(a))
-    centres = a[rng.choice(n, count, replace=False)]
-    scale = np.maximum(pooled.diagonal(), 1e-12)
-    distances = (((a[:, None] - centres) ** 2) / scale).sum(axis=2)
-    shares = np.zeros((n, count))
-    shares[np.arange(n), distances.argmin(axis=1)] = 1.0
-    for _ in range(EM_ITERATIONS):
-        logs = np.stack([_log_density(a, shares[:, h], pooled, prior_samples, ridge) for h in range(count)], axis=1)
-        logs -= logs.max(axis=1, keepdims=True)
-        before, shares = shares, np.exp(logs)
-        shares /= shares.sum(axis=1, keepdims=True)
-        if np.abs(shares - before).max() < CONVERGED:
-            break
-    likeliest = shares.argmax(axis=1)
+    seed = int(rng.integers(2**31))
+    if count == 1:
+        return [np.arange(n)]
+    points = a / np.sqrt(np.maximum(pooled.diagonal(), SMALLEST_VARIANCE))
+    widening = ridge + prior_samples / (prior_samples + n / count)
+    mixture = GaussianMixture(count, reg_covar=widening, max_iter=EM_ITERATIONS, random_state=seed)
+    with threadpool_limits(limits=1), warnings.catch_warnings():
+        # Components that still change after EM_ITERATIONS are as good a division as any.
+        warnings.simplefilter("ignore", ConvergenceWarning)
+        likeliest = mixture.fit_predict(points)
     return [np.flatnonzero(likeliest == h) for h in range(count) if (likeliest == h).any()]
-
-
-def _log_density(a: Array, share: Array, pooled: Array, prior_samples: float, ridge: float) -> Array:
-    """log(w Normal(a; m, C)) [n] up to a constant, of the component in which samples have these shares."""
-    weight = share.sum()
-    if weight < 1e-9:
-        return np.full(len(a), -np.inf)
-    mean = share @ a / weight
-    centred = a - mean
-    own = (centred * share[:, None]).T @ centred
-    covariance = (own + prior_samples * pooled) / (weight + prior_samples)
-    covariance[np.diag_indices(len(mean))] += ridge * np.maximum(pooled.diagonal(), 1e-12)
-    root = np.linalg.cholesky(covariance)
-    whitened = np.linalg.solve(root, centred.T)
-    log: Array = np.log(weight) - np.log(root.diagonal()).sum() - (whitened**2).sum(axis=0) / 2
-    return log

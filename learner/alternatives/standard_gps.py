@@ -10,49 +10,59 @@ differ in their localisation and in nothing else. The policy still sees canonica
 
 from __future__ import annotations
 
-from collections.abc import Mapping
-from typing import Any
+from dataclasses import dataclass
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner.algorithm.features import NONE, Rows, acting_rows
+from t6gps.learner.algorithm.features import rows_of, spread
+from t6gps.learner.episodes import Columns, acting
+from t6gps.learner.rows import NONE, Floats, Ints, Rows
 from t6gps.storage import schema
 
 Array = NDArray[np.float64]
-Labels = NDArray[np.int64]
+Entry = TypeVar("Entry", bound=np.floating)
 
 
-def read_rows(episodes: Mapping[int, pa.Table], labels: Labels) -> Rows:
-    """Rows in world axes; the direction of an episode stands in the place of the entry edge.
+@dataclass(frozen=True)
+class InWorld:
+    """Reads rows in world axes; the direction of an episode stands in the place of the entry edge.
 
-    `labels` [elements, nu] gives the canonical label of each world label, by symmetry element. DataError as for
-    `features.read_rows`.
+    labels   canonical label of each world label, by symmetry element [elements, nu]
     """
-    tables, acts, starts = acting_rows(episodes)
-    table = pa.concat_tables(tables)
-    rows_n = len(acts)
-    canonical = labels[_numbers(table, "element").astype(np.int64)]
-    ways = np.stack([_numbers(table, f"waypoint_{axis}_m") - _numbers(table, f"com_{axis}_m") for axis in "xy"], axis=1)
-    target = ways / np.linalg.norm(ways, axis=1, keepdims=True)
-    first = target[np.maximum.accumulate(np.where(starts, np.arange(rows_n), 0))]
-    _, direction = np.unique(first.round(3), axis=0, return_inverse=True)
-    nothing = np.full(rows_n, NONE)
-    return Rows(
-        state=_world_state(table).astype(np.float32),
-        action=_in_world(table, "action", acts, canonical),
-        action_mean=_in_world(table, "action_mean", acts, canonical),
-        target=target.astype(np.float32),
-        observation=_numbers(table, "observation").astype(np.float32),
-        kind=np.zeros(rows_n, dtype=np.int64),
-        entry=direction.ravel().astype(np.int64),
-        exit=nothing,
-        starts=starts,
-        acts=acts,
-        continues=acts.copy(),
-        labels=canonical,
-    )
+
+    labels: Ints
+
+    def read(self, frames: pa.Table) -> Columns:
+        """Columns of one episode; `direction` is that of its first row. DataError as from `features.Canonical.read`."""
+        acts = acting(frames)
+        rows_n = len(acts)
+        canonical = self.labels[_numbers(frames, "element").astype(np.int64)]
+        position, waypoint = (
+            np.stack([_numbers(frames, f"{name}_{axis}_m") for axis in "xy"], axis=1) for name in ("com", "waypoint")
+        )
+        target = (waypoint - position) / np.linalg.norm(waypoint - position, axis=1, keepdims=True)
+        return {
+            "state": _world_state(frames).astype(np.float32),
+            "action": spread(to_world(_numbers(frames, "action"), canonical[acts]), acts),
+            "action_mean": spread(to_world(_numbers(frames, "action_mean"), canonical[acts]), acts),
+            "target": target.astype(np.float32),
+            "observation": _numbers(frames, "observation").astype(np.float32),
+            "kind": np.zeros(rows_n, dtype=np.int64),
+            "exit": np.full(rows_n, NONE),
+            "starts": np.arange(rows_n) == 0,
+            "acts": acts,
+            "continues": acts,
+            "labels": canonical,
+            "direction": np.tile(target[0].round(3), (rows_n, 1)),
+        }
+
+    def rows(self, columns: Columns) -> Rows:
+        """Rows of all episodes, whose directions are numbered."""
+        _, direction = np.unique(columns["direction"], axis=0, return_inverse=True)
+        return rows_of(columns, entry=direction.ravel().astype(np.int64))
 
 
 def _numbers(table: pa.Table, name: str) -> Array:
@@ -68,19 +78,12 @@ def _world_state(table: pa.Table) -> Array:
     return np.concatenate([velocity, about.reshape(-1, 18), axes.reshape(-1, 18)], axis=1)
 
 
-def _in_world(table: pa.Table, name: str, acts: NDArray[np.bool_], canonical: Labels) -> NDArray[np.float32]:
-    values = _numbers(table, name)
-    actions = np.full((len(acts), values.shape[1]), np.nan, dtype=np.float32)
-    actions[acts] = to_world(values, canonical[acts])
-    return actions
-
-
-def to_world(actions: NDArray[Any], canonical: Labels) -> NDArray[Any]:
+def to_world(actions: NDArray[Entry], canonical: Ints) -> NDArray[Entry]:
     """Canonical actions [n, nu] in world labels."""
     return np.take_along_axis(actions, canonical, axis=1)
 
 
-def to_canonical(actions: NDArray[np.float32], canonical: Labels) -> NDArray[np.float32]:
+def to_canonical(actions: Floats, canonical: Ints) -> Floats:
     """Actions [n, nu] in world labels, relabelled."""
     relabelled = np.empty_like(actions)
     np.put_along_axis(relabelled, canonical, actions, axis=1)
