@@ -24,7 +24,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner.rows import VELOCITY_N, Ints, Rows, pieces
+from t6gps.learner.rows import PIECE_ROWS, VELOCITY_N, Ints, Rows, pieces
 
 Array = NDArray[np.float64]
 
@@ -103,9 +103,9 @@ def moments(samples: Array) -> Moments:
     return Moments(len(samples), mean, centred.T @ centred / len(samples))
 
 
-def pooled_moments(rows: Rows, chosen: Ints) -> Moments:
+def pooled_moments(rows: Rows, chosen: Ints, piece_rows: int = PIECE_ROWS) -> Moments:
     """Moments of the joint vectors of rows [m] that continue, m >= 1; in pieces, since there may be a million."""
-    n, parts = len(chosen), pieces(chosen)
+    n, parts = len(chosen), pieces(chosen, piece_rows)
     mean = np.sum([rows.samples(part).astype(np.float64).sum(axis=0) for part in parts], axis=0) / n
 
     def squares(part: Ints) -> Array:

@@ -141,10 +141,11 @@ class Transitions:
             inputs[:, schema.TARGET] = direction
         return torch.from_numpy(inputs), torch.from_numpy(rest_lengths)
 
-    def filed(self) -> Transitions:
-        """The same with its wide part in a file, where it is large and in memory."""
-        large = len(self.acts) > HELD_ROWS and isinstance(self.wide, Held)
-        return replace(self, wide=Filed(self.wide)) if large and isinstance(self.wide, Held) else self
+    def filed(self, held_rows: int = HELD_ROWS) -> Transitions:
+        """The same with its wide part in a file, if it is in memory and has more rows than may stay there."""
+        if len(self.acts) > held_rows and isinstance(self.wide, Held):
+            return replace(self, wide=Filed(self.wide))
+        return self
 
 
 def joined(iterations: Sequence[Transitions]) -> Transitions:

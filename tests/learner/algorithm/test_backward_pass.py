@@ -9,10 +9,9 @@ import pytest
 from numpy.typing import NDArray
 
 from t6gps.learner import cost
-from t6gps.learner.algorithm import backward_pass as lqg
-from t6gps.learner.algorithm.features import Rows
-from t6gps.learner.algorithm.modes import Models
-from t6gps.learner.bench.speed import plain_backward_pass
+from t6gps.learner.algorithm.backward_pass import Improvement, backward_pass, predicted_change, prepare
+from t6gps.learner.algorithm.regression import Models
+from t6gps.learner.bench.references import plain_backward_pass
 from t6gps.storage.errors import DataError
 
 NX, NU, T, B, C = 5, 3, 6, 4, 0.05
@@ -29,8 +28,8 @@ class Problem:
     root: Array
     deviation: Array
 
-    def solve(self) -> lqg.Improvement:
-        return lqg.backward_pass(lqg.prepare(self.models, C), self.index, self.residual, self.root, self.deviation)
+    def solve(self) -> Improvement:
+        return backward_pass(prepare(self.models, C), self.index, self.residual, self.root, self.deviation)
 
     def objective(self, b: int, actions: Array) -> tuple[float, float]:
         """Change of the running cost and value of the KL term under du = actions [T, nu], by model rollout."""
@@ -43,7 +42,7 @@ class Problem:
             change += (np.square(self.residual[b, t] + self.root @ dx) - np.square(self.residual[b, t])).sum() / 2
         return change, kl
 
-    def closed_loop(self, b: int, improved: lqg.Improvement) -> Array:
+    def closed_loop(self, b: int, improved: Improvement) -> Array:
         """Actions of the improved policy from the recorded first state on [T, nu]."""
         dx, actions = np.zeros(NX), []
         for t in range(T):
@@ -128,15 +127,15 @@ def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> N
 def test_what_actions_from_elsewhere_are_promised_is_the_model_rollout_too() -> None:
     case = problem()
     actions = np.random.default_rng(1).normal(0, 0.2, (B, T, NU))
-    found = lqg.predicted_change(case.models.F, case.index, case.residual, case.root, actions)
+    found = predicted_change(case.models.F, case.index, case.residual, case.root, actions)
     for b in range(B):
         assert found[b].sum() == pytest.approx(case.objective(b, actions[b])[0], rel=1e-4)
 
 
 def test_a_heavy_kl_term_returns_the_policy_mean() -> None:
     case = problem()
-    models = lqg.prepare(case.models, 1e4)
-    improved = lqg.backward_pass(models, case.index, case.residual, case.root, case.deviation)
+    models = prepare(case.models, 1e4)
+    improved = backward_pass(models, case.index, case.residual, case.root, case.deviation)
     np.testing.assert_allclose(improved.k, -case.deviation, atol=1e-3)
 
 
@@ -145,16 +144,16 @@ def test_sub_trajectories_do_not_influence_each_other() -> None:
     together = case.solve()
     for b in range(B):
         one = slice(b, b + 1)
-        alone = lqg.backward_pass(
-            lqg.prepare(case.models, C), case.index[one], case.residual[one], case.root, case.deviation[one]
+        alone = backward_pass(
+            prepare(case.models, C), case.index[one], case.residual[one], case.root, case.deviation[one]
         )
         np.testing.assert_allclose(alone.k, together.k[one], rtol=1e-5)
 
 
 def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
     models = problem().models
-    np.testing.assert_allclose(lqg.prepare(models, C, 0.04).R_inverse, 0.04 / C)
-    np.testing.assert_allclose(lqg.prepare(models, C, 0.0).R_inverse, 1e-4 / C)
+    np.testing.assert_allclose(prepare(models, C, 0.04).R_inverse, 0.04 / C)
+    np.testing.assert_allclose(prepare(models, C, 0.0).R_inverse, 1e-4 / C)
 
 
 @pytest.mark.parametrize("variance", [0.02, 0.0])
@@ -175,7 +174,7 @@ def test_a_plain_loop_in_double_precision_gives_the_same_to_four_digits(
     target /= np.linalg.norm(target, axis=2, keepdims=True)
     residual = cost.residual(rng.normal(0, 0.5, (b, length, nx)), target, 0.8, 0.1)
     root, deviation = cost.root(nx, 0.1), rng.normal(0, np.sqrt(variance), (b, length, nu))
-    found = lqg.backward_pass(lqg.prepare(models, 0.02, variance), model, residual, root, deviation)
+    found = backward_pass(prepare(models, 0.02, variance), model, residual, root, deviation)
     for one in range(b):
         given = residual[one] @ root, root.T @ root, deviation[one]
         K, k, change = plain_backward_pass(F[model[one]], P[model[one]], variance, 0.02, *given)
@@ -200,18 +199,3 @@ def test_arrays_that_do_not_fit_together_are_refused(changed: str) -> None:
         case.deviation = case.deviation[:, :-1]
     with pytest.raises(ValueError, match="other types or shapes"):
         case.solve()
-
-
-@pytest.mark.parametrize("horizon", [1, 7, 10, 1000])
-def test_sub_trajectories_cover_every_transition_once_and_never_span_a_gap(rows: Rows, horizon: int) -> None:
-    pieces = lqg.sub_trajectories(rows.continues, horizon)
-    covered = np.zeros(len(rows.continues), dtype=int)
-    for length, starts in pieces.items():
-        assert 1 <= length <= horizon
-        for start in starts:
-            covered[start : start + length] += 1
-            begins_run = start == 0 or not rows.continues[start - 1]
-            assert begins_run or rows.continues[start - 1]
-            ends_run = not rows.continues[start + length]
-            assert length == horizon or ends_run
-    assert np.array_equal(covered, rows.continues.astype(int))

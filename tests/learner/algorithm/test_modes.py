@@ -6,7 +6,9 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from t6gps.learner.algorithm.modes import FitOptions, Models, Moments, fit_modes, moments
+from t6gps.learner.algorithm.modes import FitOptions, fit_modes
+from t6gps.learner.algorithm.regression import Models, Moments, moments
+from t6gps.learner.bench.references import sklearn_modes
 
 NX, NU = 6, 4
 ALONE = FitOptions(modes=4, residual_threshold=1.0, prior_samples=0.0, ridge=1e-9)
@@ -159,3 +161,31 @@ def test_the_fit_is_a_function_of_samples_and_generator() -> None:
     samples = np.vstack([plant(300, system(seed), rng, 0.3) for seed in range(3)])
     first, second = (fit(samples, FitOptions(4, 0.5, 50.0, 1e-3)) for _ in range(2))
     assert first[0].F.tobytes() == second[0].F.tobytes() and np.array_equal(first[1], second[1])
+
+
+@pytest.mark.parametrize("outliers", [0.02, 0.2, 0.35])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_first_mode_is_at_least_as_good_as_that_of_ransac_regressor(outliers: float, seed: int) -> None:
+    """Planted inliers found, and error of the slopes, against scikit-learn with the same residual and subset size."""
+    rng, n = np.random.default_rng(seed), 800
+    samples = plant(n, system(1), rng, 0.05)
+    planted = rng.random(n) >= outliers
+    samples[~planted, NX + NU :] += rng.normal(0, 5, ((~planted).sum(), NX))
+    options = FitOptions(modes=1, residual_threshold=0.35, prior_samples=0.0, ridge=1e-9)
+    models, _, residual = fit(samples, options)
+    reference = next(sklearn_modes(samples, NX, options))
+    agreed = [(inlier == planted).mean() for inlier in (residual < options.residual_threshold, reference)]
+    assert agreed[0] >= agreed[1] and agreed[0] > 0.99
+    z, target = samples[reference, : NX + NU], samples[reference, NX + NU :]
+    slopes = np.linalg.lstsq(z - z.mean(axis=0), target - target.mean(axis=0), rcond=None)[0].T
+    ours, theirs = (np.sqrt(np.mean((F - system(1)) ** 2)) for F in (models.F[0], slopes))
+    assert ours < 1.1 * theirs and ours < 0.01
+
+
+def test_as_much_is_explained_as_by_recursive_ransac_regressor() -> None:
+    rng = np.random.default_rng(7)
+    samples = np.vstack([plant(n, system(seed), rng, 0.05) for seed, n in ((1, 500), (6, 300))])
+    options = FitOptions(modes=2, residual_threshold=0.35, prior_samples=0.0, ridge=1e-9)
+    _, _, residual = fit(samples, options)
+    reference = np.any(list(sklearn_modes(samples, NX, options)), axis=0)
+    assert (residual < options.residual_threshold).mean() >= max(float(reference.mean()), 0.99)

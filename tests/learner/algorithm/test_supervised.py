@@ -9,6 +9,7 @@ import torch
 
 from t6gps.learner import policy
 from t6gps.learner.algorithm import supervised
+from t6gps.learner.algorithm.pairs import every
 from t6gps.learner.settings import LearnerSettings
 from t6gps.storage.records import PolicySnapshot
 
@@ -28,7 +29,7 @@ def pairs(n: int = 1000) -> tuple[Any, Any]:
 
 def run(snapshot: PolicySnapshot, settings: LearnerSettings = SETTINGS, seed: int = 1) -> Any:
     y, u = pairs()
-    training = supervised.train(snapshot, y, u, settings, np.random.default_rng(seed))
+    training = supervised.train(snapshot, every(y, u), settings, np.random.default_rng(seed))
     progress = []
     while True:
         try:

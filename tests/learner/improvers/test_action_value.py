@@ -12,10 +12,15 @@ import pytest
 import torch
 
 from t6gps.learner import policy
-from t6gps.learner.improvers import action_value as value
+from t6gps.learner.episodes import Episodes
+from t6gps.learner.improvers import action_value, transitions
+from t6gps.learner.improvers.action_value import ActionValue
+from t6gps.learner.improvers.transitions import MOVED, Filed, Held, Transitions, joined
 from t6gps.learner.learner import Learner
+from t6gps.learner.rows import Floats
 from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage import schema
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.storage.schema import FRAMES
 
@@ -24,7 +29,7 @@ AHEAD, LEFT = 0, 1
 """Winches of the planted world: what the first two do in a step is its velocity along the axes of the frame."""
 
 
-def planted(seed: int) -> value.Transitions:
+def planted(seed: int) -> Transitions:
     """Transitions in which 0.5 (e[0], e[1]) is the velocity after a step, in the frame before it, whatever came before.
 
     Frames are turned and mirrored at random from row to row.
@@ -44,7 +49,8 @@ def planted(seed: int) -> value.Transitions:
     speed = 0.5 * np.hypot(e[:-1, LEFT], e[:-1, AHEAD])
     velocities[1:, :2] += (speed * np.array([np.cos(after), np.sin(after)])).T
     acts = np.arange(n) % ROWS_N != ROWS_N - 1
-    return value.Transitions(np.hstack([observation, velocities, e]), rest, turn, side, heading, acts)
+    parts = observation, velocities[:, :3], velocities[:, 3:], rest + np.float32(REACH_M) * e
+    return Transitions(Held(parts, rest), parts[1], turn, side, heading, acts, REACH_M)
 
 
 def untrained() -> PolicySnapshot:
@@ -52,20 +58,26 @@ def untrained() -> PolicySnapshot:
     return policy.initial(schema.OBSERVATION_N, 24, (16,), rng, offset_m=1.088, scale_m=0.2)
 
 
-def own_commands(transitions: value.Transitions) -> value.Floats:
-    return policy.act(untrained(), transitions.inputs[:, : schema.OBSERVATION_N])
+def every(known: Transitions) -> tuple[Floats, Floats]:
+    """[s; e] and rest lengths of all rows."""
+    inputs, rest_lengths = known.take(np.arange(len(known.acts)))
+    return inputs.numpy(), rest_lengths.numpy()
 
 
-def learned(transitions: value.Transitions) -> value.ActionValue:
-    found = value.ActionValue(REACH_M, 2.0, 0.1, np.random.default_rng(3))
-    found.add(transitions)
-    steps_n = found.steps_n
-    assert sum(1 for _ in found.learn(untrained(), np.random.default_rng(4))) == steps_n
-    return found
+def policys_commands(known: Transitions) -> Floats:
+    return policy.act(untrained(), every(known)[0][:, : schema.OBSERVATION_N])
+
+
+def learned(known: Transitions) -> ActionValue:
+    value = ActionValue(2.0, 0.1, np.random.default_rng(3))
+    value.add(known)
+    steps_n = value.steps_n
+    assert sum(1 for _ in value.learn(untrained(), np.random.default_rng(4))) == steps_n
+    return value
 
 
 @pytest.fixture(scope="module")
-def found() -> value.ActionValue:
+def value() -> ActionValue:
     return learned(planted(0))
 
 
@@ -73,12 +85,12 @@ def same(a: dict[str, Any], b: dict[str, Any]) -> bool:
     return a.keys() == b.keys() and all(np.array_equal(a[key], b[key]) for key in a)
 
 
-def test_improved_actions_move_the_winches_that_drive_and_no_others(found: value.ActionValue) -> None:
-    transitions = planted(0)
-    own = own_commands(transitions)
-    moved = found.improved(untrained()) - own
-    within = np.abs(own - transitions.rest_lengths) < REACH_M / 2
-    for winch, along in zip((AHEAD, LEFT), transitions.inputs[:, schema.TARGET].T, strict=True):
+def test_improved_actions_move_the_winches_that_drive_and_no_others(value: ActionValue) -> None:
+    known = planted(0)
+    commands, (inputs, rest_lengths) = policys_commands(known), every(known)
+    moved = value.improved(untrained()) - commands
+    within = np.abs(commands - rest_lengths) < REACH_M / 2
+    for winch, along in zip((AHEAD, LEFT), inputs[:, schema.TARGET].T, strict=True):
         clear = within & (np.abs(along) > 0.3)[:, None]
         signed = moved * np.sign(along)[:, None]
         assert (signed > 0)[clear[:, winch], winch].mean() > 0.95
@@ -86,42 +98,43 @@ def test_improved_actions_move_the_winches_that_drive_and_no_others(found: value
         assert np.abs(others).max() < 0.33 * signed[clear[:, winch], winch].mean()
 
 
-def test_a_command_beyond_the_reach_of_its_winch_stays(found: value.ActionValue) -> None:
-    transitions, own = planted(0), own_commands(planted(0))
-    beyond = np.abs(own - transitions.rest_lengths) > REACH_M
+def test_a_command_beyond_the_reach_of_its_winch_stays(value: ActionValue) -> None:
+    commands, (_, rest_lengths) = policys_commands(planted(0)), every(planted(0))
+    beyond = np.abs(commands - rest_lengths) > REACH_M
     assert 0.3 < beyond.mean() < 0.9
-    assert np.array_equal(found.improved(untrained())[beyond], own[beyond])
+    assert np.array_equal(value.improved(untrained())[beyond], commands[beyond])
 
 
-def test_the_slope_is_that_of_the_value(found: value.ActionValue) -> None:
-    transitions, rows = planted(5), np.arange(50)
-    rest = torch.from_numpy(transitions.rest_lengths[rows])
+def test_the_slope_is_that_of_the_value(value: ActionValue) -> None:
+    inputs, rest = planted(5).take(np.arange(50))
     command = rest + REACH_M * torch.linspace(-2, 2, 24).roll(3)
-    inputs = torch.from_numpy(transitions.inputs[rows])
 
-    def q(command: torch.Tensor) -> torch.Tensor:
-        inputs[:, value.MOVED] = found._moved(transitions, rows, command)
-        layers = [(weight.double(), bias.double()) for weight, bias in found._layers]
-        return policy.activations(layers, inputs.double())[-1][:, 0]
+    def at(command: torch.Tensor) -> torch.Tensor:
+        moved = inputs.clone()
+        moved[:, MOVED] = ((command - rest) / REACH_M).clamp(-1, 1)
+        return moved
 
-    q(command)
-    slope = found._slope(inputs)
+    slope, step_m = value.slope(at(command), REACH_M), 2e-2
     for winch in range(24):
         step = torch.zeros(24)
-        step[winch] = 1e-3
-        assert torch.allclose((q(command + step) - q(command - step)) / 2e-3, slope[:, winch].double(), atol=0.05)
-        assert ((command - rest)[0, winch].abs() < REACH_M) == (slope[:, winch] != 0).any()
+        step[winch] = step_m
+        within = (command - rest)[0, winch].abs()
+        if (within - REACH_M).abs() > step_m:
+            difference = (value.values(at(command + step)) - value.values(at(command - step))) / (2 * step_m)
+            assert torch.allclose(difference, slope[:, winch], atol=0.05)
+        assert (within < REACH_M) == (slope[:, winch] != 0).any()
 
 
-def test_the_last_row_of_an_episode_is_no_transition(found: value.ActionValue) -> None:
+def test_the_last_row_of_an_episode_is_no_transition(value: ActionValue) -> None:
     """What stands in it besides its state is never read: poison it."""
     poisoned = planted(0)
-    poisoned.inputs[~poisoned.acts, value.MOVED] = np.nan
-    assert same(learned(poisoned).arrays(), found.arrays())
+    assert isinstance(poisoned.wide, Held)
+    poisoned.wide.parts[-1][~poisoned.acts] = np.nan
+    assert same(learned(poisoned).arrays(), value.arrays())
 
 
 def test_learning_is_a_function_of_its_arguments_whatever_part_of_a_batch_is_done_first(
-    found: value.ActionValue, monkeypatch: pytest.MonkeyPatch
+    value: ActionValue, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     class OneByOne:
         """Runs everything at once in this thread, the last part first."""
@@ -134,11 +147,38 @@ def test_learning_is_a_function_of_its_arguments_whatever_part_of_a_batch_is_don
         def map(self, function: Any, *items: Any) -> Iterator[Any]:
             return reversed([function(*each) for each in reversed(list(zip(*items, strict=True)))])
 
-    expected = found.improved(untrained())
-    monkeypatch.setattr(value, "ThreadPoolExecutor", OneByOne)
+    expected = value.improved(untrained())
+    monkeypatch.setattr(action_value, "ThreadPoolExecutor", OneByOne)
     other = learned(planted(0))
-    assert same(other.arrays(), found.arrays())
+    assert same(other.arrays(), value.arrays())
     assert np.array_equal(other.improved(untrained()), expected)
+
+
+def test_transitions_that_are_filed_away_are_learned_from_as_those_in_memory(value: ActionValue) -> None:
+    known = planted(0)
+    assert isinstance(known.wide, Held) and known.filed() is known, "an iteration of this size stays in memory"
+    filed = known.filed(held_rows=0)
+    assert isinstance(filed.wide, Filed) and filed.filed(held_rows=0) is filed
+    assert same(learned(filed).arrays(), value.arrays())
+
+
+def test_transitions_of_several_iterations_are_taken_as_from_one() -> None:
+    parts = [planted(seed) for seed in range(3)]
+    several = joined([parts[0], parts[1].filed(held_rows=0), parts[2]])
+    n = len(parts[0].acts)
+    rows = np.random.default_rng(0).integers(3 * n, size=200)
+    for taken, wholes in zip(several.take(rows), zip(*map(every, parts), strict=True), strict=True):
+        assert np.array_equal(taken.numpy(), np.concatenate(wholes)[rows])
+    headings = np.concatenate([part.heading for part in parts])[rows]
+    assert np.array_equal(several.heading[rows], headings)
+    single = parts[1].direction(rows[(rows >= n) & (rows < 2 * n)] - n, headings[(rows >= n) & (rows < 2 * n)])
+    assert np.array_equal(several.direction(rows, headings)[(rows >= n) & (rows < 2 * n)], single)
+
+
+def test_a_folder_that_cannot_be_written_is_named(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "missing"))
+    with pytest.raises(RunError, match=r"10000 transitions cannot be filed away in .*missing.*TMPDIR"):
+        planted(0).filed(held_rows=0)
 
 
 def with_motion(table: pa.Table, seed: int) -> pa.Table:
@@ -158,14 +198,19 @@ def with_motion(table: pa.Table, seed: int) -> pa.Table:
 
 def test_what_is_read_of_an_episode_gives_back_its_columns(tables: list[pa.Table]) -> None:
     table, mirrored = with_motion(tables[0], 1), np.arange(24) % 2 == 1
-    found = value.read({0: table}, mirrored, REACH_M)
+    episodes = Episodes([transitions.Recalled(), transitions.Motion(mirrored)], 20)
+    episodes.add(0, table)
+    known = transitions.of_columns(episodes.joined()[0], REACH_M)
     rows, target = np.arange(table.num_rows), schema.array(table, "target_direction")
-    assert np.allclose(found.direction(rows, found.heading), target, atol=1e-5)
+    assert np.allclose(known.direction(rows, known.heading), target, atol=1e-5)
+    inputs, _ = every(known)
     moved = (schema.array(table, "action") - schema.array(table, "rest_lengths")[:-1]) / REACH_M
-    assert np.allclose(found.inputs[:-1, value.MOVED], np.clip(moved, -1, 1), atol=1e-5)
-    assert np.array_equal(found.inputs[:, value.COM_VELOCITY], schema.array(table, "com_velocity"))
-    across = found.direction(rows, found.heading + np.float32(np.pi / 2))
-    assert np.array_equal(found.towards(rows, across)[:, schema.TARGET].numpy(), across)
+    assert np.allclose(inputs[:-1, MOVED], np.clip(moved, -1, 1), atol=1e-5) and not inputs[-1, MOVED].any()
+    assert np.array_equal(known.com_velocity, schema.array(table, "com_velocity"))
+    state = np.hstack([schema.array(table, name) for name in transitions.STATE])
+    assert np.array_equal(inputs[:, : state.shape[1]], state)
+    across = known.direction(rows, known.heading + np.float32(np.pi / 2))
+    assert np.array_equal(known.take(rows, across)[0][:, schema.TARGET].numpy(), across)
     sign = target[:, 0] * across[:, 1] - target[:, 1] * across[:, 0]  # a mirrored frame sees the other side
     assert np.allclose(sign, np.where(mirrored[schema.array(table, "element")], -1, 1), atol=1e-5)
 
@@ -178,8 +223,8 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
     tmp_path: Path,
 ) -> None:
     for name in ("STEPS", "FIRST_STEPS"):
-        monkeypatch.setattr(value, name, 30)
-    monkeypatch.setattr(value, "REMEMBERED_N", 2)
+        monkeypatch.setattr(action_value, name, 30)
+    monkeypatch.setattr(action_value, "REMEMBERED_N", 2)
     moving = [with_motion(table, number) for number, table in enumerate(tables)]
     kept: dict[int, list[pa.Table]] = {}
     monkeypatch.setattr(
