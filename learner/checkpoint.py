@@ -4,14 +4,12 @@ from __future__ import annotations
 
 from collections import deque
 from collections.abc import Mapping
-from typing import Any
-
-from numpy.typing import NDArray
 
 from t6gps.learner.algorithm import pairs
 from t6gps.learner.algorithm.pairs import Pairs
 from t6gps.learner.improvers.action_value import ActionValue
 from t6gps.learner.port import Arrays, LearnerState, Manifest
+from t6gps.learner.rows import AnyArray
 from t6gps.storage.errors import CheckpointError, RunError
 from t6gps.storage.records import PolicySnapshot
 
@@ -64,7 +62,7 @@ class Carried:
         }
         return LearnerState(manifest, arrays)
 
-    def unpack(self, manifest: Manifest, arrays: Mapping[str, NDArray[Any]], value: ActionValue | None) -> None:
+    def unpack(self, manifest: Manifest, arrays: Mapping[str, AnyArray], value: ActionValue | None) -> None:
         """Continue from `pack`, as does the action value.
 
         Raises CheckpointError when entries are missing or the network has another shape than the present one.
@@ -99,7 +97,7 @@ def _arrays(snapshot: PolicySnapshot, name: str) -> Arrays:
     return arrays
 
 
-def _policy(manifest: Manifest, arrays: Mapping[str, NDArray[Any]], name: str, version: int) -> PolicySnapshot:
+def _policy(manifest: Manifest, arrays: Mapping[str, AnyArray], name: str, version: int) -> PolicySnapshot:
     """The policy of which `_arrays` has made these layers. KeyError when one is missing."""
     layers = tuple(
         (arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"]) for number in range(manifest["layers"])

@@ -7,18 +7,16 @@ of it is kept.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from t6gps.learner.algorithm.segments import Pieces, cut, join
-from t6gps.learner.rows import Flags, Rows
+from t6gps.learner.rows import AnyArray, Flags, Ints, Rows
 from t6gps.storage.errors import DataError
 
-Column = NDArray[Any]
-Columns = dict[str, Column]
+Columns = dict[str, AnyArray]
 
 BLOCK_BYTES = 2**25
 """Memory for many episodes' entries of a column. Blocks of this size go back to the operating system when they are let
@@ -95,10 +93,10 @@ class _Blocks:
     """A column of many episodes in blocks of memory."""
 
     def __init__(self) -> None:
-        self._parts: list[Column] = []
-        self._free: Column | None = None
+        self._parts: list[AnyArray] = []
+        self._free: AnyArray | None = None
 
-    def append(self, values: Column) -> None:
+    def append(self, values: AnyArray) -> None:
         """Copy an episode's entries [rows, ...]."""
         n = len(values)
         if self._free is None or len(self._free) < n:
@@ -108,7 +106,7 @@ class _Blocks:
         part[:] = values
         self._parts.append(part)
 
-    def joined(self, order: NDArray[np.int64]) -> Column:
+    def joined(self, order: Ints) -> AnyArray:
         """The parts in this order as one array; each block is let go when its parts are copied."""
         lengths = np.array([len(part) for part in self._parts])
         first = np.empty_like(order)

@@ -11,11 +11,10 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from dataclasses import dataclass
-from typing import Any, TypeVar
+from typing import TypeVar
 
 import numpy as np
 import pyarrow as pa
-from numpy.typing import NDArray
 
 from t6gps.learner import policy
 from t6gps.learner.algorithm import local_models, supervised
@@ -36,7 +35,7 @@ from t6gps.learner.improvers.improver import Improved, Improver, Surrogate
 from t6gps.learner.phases import PHASES
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.report import Fitted, Iteration, Segmented, Trained, kl, report
-from t6gps.learner.rows import Floats, Ints, Rows, pieces, root_mean_square
+from t6gps.learner.rows import AnyArray, Flags, Floats, Ints, Rows, pieces, root_mean_square
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.learner.streams import Stream, branch, generator
 from t6gps.storage import schema, tables
@@ -65,8 +64,7 @@ class Learner:
     reach_m                farthest that a winch comes in a control step
     world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
     mirrored               the symmetry element mirrors the world [elements]
-    fit_map                applies a pure function to jobs, which it takes one after the other, and returns the
-                           results in their order; `map` or a pool
+    fit_map                maps a pure function over jobs as results are asked for, in their order; `map` or a pool
     keeps_earlier          the policy before the newest is kept, too, for workers that act with it in a pipelined run
     """
 
@@ -82,7 +80,7 @@ class Learner:
         scale_m: float,
         reach_m: float,
         world_labels: Ints,
-        mirrored: NDArray[np.bool_],
+        mirrored: Flags,
         fit_map: FitMap = map,
         keeps_earlier: bool = False,
     ) -> None:
@@ -102,7 +100,6 @@ class Learner:
         readings: list[Reading] = [self._rows, self._motion] if self._value else [self._rows]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
         self._done = _Done()
-        self._report: Report | None = None
 
     def _rng(self, iteration: int, stream: Stream) -> np.random.Generator:
         return generator(self._run_seed, branch(iteration, stream))
@@ -129,12 +126,12 @@ class Learner:
     def segment(self) -> Progress:
         """Join the segments of all episodes and classify them (lines 3 to 5)."""
         self._done = _Done()
-        columns, pieces_of_stays = self._episodes.joined()
+        columns, places = self._episodes.joined()
         rows = self._rows.rows(columns)
         if self._value:
             self._value.add(transitions.of_columns(columns, self._reach_m))
         yield 1, 2
-        segments = classify(rows, pieces_of_stays)
+        segments = classify(rows, places)
         segmented = self._settings.localization in SEGMENTED
         groups = group(segments, self._settings.smallest_class_segments) if segmented else []
         self._done.segmented = Segmented(rows, segments, groups)
@@ -175,26 +172,24 @@ class Learner:
         learned = improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
         seen = rows.observation[:, : SEEN_N[self._settings.observation]]
         pairs = Pairs(seen, learned, np.flatnonzero(rows.continues))
-        everything = Several([*self._carried.replayed, pairs])
-        rng = self._rng(iteration, Stream.SUPERVISED)
-        newest, loss = yield from supervised.train(self.snapshot, everything, self._settings, rng)
+        rng, all_pairs = self._rng(iteration, Stream.SUPERVISED), Several([*self._carried.replayed, pairs])
+        newest, loss = yield from supervised.train(self.snapshot, all_pairs, self._settings, rng)
         self._carried.advance(newest, pairs)
-        trained = Trained(loss, _divergence(newest, rows, seen, self._command_range_m))
-        results = Iteration(segmented, fitted, improved, trained)
-        self._report = report(results, iteration, self._command_range_m, *self._cost_weights)
-        self._done = _Done()
+        divergence = _divergence(newest, rows, seen, self._command_range_m)
+        results = Iteration(segmented, fitted, improved, Trained(loss, divergence))
+        self._done = _Done(report=report(results, iteration, self._command_range_m, *self._cost_weights))
         if self._value:
             self._value.file_away()
 
     def report(self) -> Report:
         """What the iteration just finished adds to the tables `iterations` and `classes`."""
-        return _of(self._report, "supervise")
+        return _of(self._done.report, "supervise")
 
     def state(self) -> LearnerState:
         """What the next iteration depends on, between two iterations: policies, replayed pairs, the action value."""
         return self._carried.pack(self._value)
 
-    def restore(self, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, manifest: Manifest, arrays: Mapping[str, AnyArray]) -> None:
         """Continue from `state()`. Raises CheckpointError when entries are missing or the network has another shape."""
         self._carried.unpack(manifest, arrays, self._value)
         self._episodes.clear()
@@ -205,20 +200,19 @@ class Learner:
             return
         newest = self.snapshot.version
         for iteration in range(max(newest - REMEMBERED_N + 1, 0), newest):
-            episodes = Episodes([transitions.Recalled(), self._motion], self._settings.longest_segment_steps)
-            for episode_id, frames in tables.frames_of(run, iteration, transitions.COLUMNS).items():
-                episodes.add(episode_id, frames)
-            self._value.add(transitions.of_columns(episodes.joined()[0], self._reach_m))
+            episodes = tables.frames_of(run, iteration, transitions.COLUMNS)
+            self._value.add(transitions.recalled(episodes, self._motion, self._reach_m))
             self._value.file_away()
 
 
 @dataclass
 class _Done:
-    """What the phases of the iteration at work have found."""
+    """What the phases of the iteration at work have found; after the last one, the report on it."""
 
     segmented: Segmented | None = None
     fitted: Fitted | None = None
     improved: Improved | None = None
+    report: Report | None = None
 
 
 def _of(result: Result | None, phase: str) -> Result:

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
-from typing import Any, NamedTuple, Protocol, TypedDict
+from typing import NamedTuple, Protocol, TypedDict
 
 import pyarrow as pa
-from numpy.typing import NDArray
 
+from t6gps.learner.rows import AnyArray
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import PolicySnapshot
 
-Arrays = dict[str, NDArray[Any]]
+Arrays = dict[str, AnyArray]
 Progress = Iterator[tuple[int, int]]
 """(done, total) of a phase."""
 Row = dict[str, float | None]
@@ -69,7 +69,7 @@ class LearnerPort(Protocol):
     def state(self) -> LearnerState:
         """What a checkpoint holds of the learner."""
 
-    def restore(self, manifest: Manifest, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, manifest: Manifest, arrays: Mapping[str, AnyArray]) -> None:
         """Continue from `state()`."""
 
     def recall(self, run: Run) -> None:

@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
-from typing import Any
 
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.learner.episodes import Columns, acting
-from t6gps.learner.rows import NONE, VELOCITY_N, Flags, Floats, Ints, Rows
+from t6gps.learner.rows import NONE, VELOCITY_N, AnyArray, Flags, Floats, Ints, Rows
 from t6gps.learner.settings import ReducedState
 from t6gps.storage import schema
 from t6gps.storage.errors import DataError
@@ -72,7 +71,7 @@ class Canonical:
         return rows_of(columns)
 
 
-def rows_of(columns: Columns, **others: NDArray[Any]) -> Rows:
+def rows_of(columns: Columns, **others: AnyArray) -> Rows:
     """Rows of the columns that are named after their parts, and of others."""
     named = {part.name: columns[part.name] for part in fields(Rows) if part.name in columns}
     return Rows(**named | others)

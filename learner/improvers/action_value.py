@@ -22,17 +22,15 @@ import os
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from typing import Any
 
 import numpy as np
 import torch
-from numpy.typing import NDArray
 
 from t6gps.learner import cost, policy
 from t6gps.learner.algorithm import supervised
 from t6gps.learner.improvers.transitions import INPUTS_N, MOVED, Transitions, joined
 from t6gps.learner.port import Arrays
-from t6gps.learner.rows import Floats, Ints, pieces
+from t6gps.learner.rows import AnyArray, Floats, Ints, pieces
 from t6gps.storage.records import PolicySnapshot
 
 REMEMBERED_N = 3
@@ -166,7 +164,7 @@ class ActionValue:
         tensors = {"learned": self._vector, "target": self._target} | self._moments._asdict()
         return {f"value_{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
 
-    def restore(self, arrays: Mapping[str, NDArray[Any]]) -> None:
+    def restore(self, arrays: Mapping[str, AnyArray]) -> None:
         """Continue from `arrays()`; the transitions are yet to be added. KeyError when an entry is missing."""
         self._remembered.clear()
         self._vector.copy_(torch.from_numpy(arrays["value_learned"]))

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import weakref
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -19,7 +19,7 @@ import torch
 
 from t6gps.learner import policy
 from t6gps.learner.algorithm.features import spread, vectors
-from t6gps.learner.episodes import Columns, acting
+from t6gps.learner.episodes import Columns, Episodes, acting
 from t6gps.learner.rows import VELOCITY_N, Flags, Floats, Ints, pieces
 from t6gps.storage import schema
 from t6gps.storage.errors import RunError
@@ -183,7 +183,6 @@ class Motion:
         }
 
 
-@dataclass(frozen=True)
 class Recalled:
     """Reads what transitions need of an episode of an earlier iteration."""
 
@@ -197,6 +196,14 @@ class Recalled:
             "starts": np.arange(len(acts)) == 0,
             "acts": acts,
         }
+
+
+def recalled(episodes: Mapping[int, pa.Table], motion: Motion, reach_m: float) -> Transitions:
+    """Transitions of an earlier iteration from its episodes, by their ids. DataError as from `Episodes`."""
+    taken = Episodes([Recalled(), motion], longest_segment_steps=2**31)  # segments are of no use here
+    for episode_id, frames in episodes.items():
+        taken.add(episode_id, frames)
+    return of_columns(taken.joined()[0], reach_m)
 
 
 def of_columns(columns: Columns, reach_m: float) -> Transitions:

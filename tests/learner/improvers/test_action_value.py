@@ -12,7 +12,6 @@ import pytest
 import torch
 
 from t6gps.learner import policy
-from t6gps.learner.episodes import Episodes
 from t6gps.learner.improvers import action_value, transitions
 from t6gps.learner.improvers.action_value import ActionValue
 from t6gps.learner.improvers.transitions import MOVED, Filed, Held, Transitions, joined
@@ -198,9 +197,7 @@ def with_motion(table: pa.Table, seed: int) -> pa.Table:
 
 def test_what_is_read_of_an_episode_gives_back_its_columns(tables: list[pa.Table]) -> None:
     table, mirrored = with_motion(tables[0], 1), np.arange(24) % 2 == 1
-    episodes = Episodes([transitions.Recalled(), transitions.Motion(mirrored)], 20)
-    episodes.add(0, table)
-    known = transitions.of_columns(episodes.joined()[0], REACH_M)
+    known = transitions.recalled({0: table}, transitions.Motion(mirrored), REACH_M)
     rows, target = np.arange(table.num_rows), schema.array(table, "target_direction")
     assert np.allclose(known.direction(rows, known.heading), target, atol=1e-5)
     inputs, _ = every(known)
