@@ -18,9 +18,12 @@ from t6gps.storage.errors import DataError
 
 Columns = dict[str, AnyArray]
 
-BLOCK_BYTES = 2**25
-"""Memory for many episodes' entries of a column. Blocks of this size go back to the operating system when they are let
-go, while smaller ones would leave holes; pages that nothing was written to cost nothing."""
+BLOCK_BYTES = 2**26
+"""Memory for many episodes' entries of a column.
+
+Blocks of more than 32 MB come from the operating system and go back to it, while smaller ones may leave holes in the
+heap. Pages that nothing was written to cost nothing.
+"""
 
 
 class Reading(Protocol):
