@@ -10,7 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner.features import VELOCITY_N
+from t6gps.learner.rows import VELOCITY_N
 
 Array = NDArray[np.floating]
 

@@ -1,16 +1,21 @@
-"""What each phase of an iteration leaves behind, and what of it goes into the tables `iterations` and `classes`."""
+"""What of an iteration goes into the tables `iterations` and `classes`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.learner import cost, lqg, supervised, surrogate, warping
-from t6gps.learner.features import NONE, Rows
-from t6gps.learner.segments import SegmentGroup, Segments
+from t6gps.learner import cost
+from t6gps.learner.algorithm import supervised, warping
+from t6gps.learner.algorithm.backward_pass import ACTION_VARIANCE_FLOOR_M2
+from t6gps.learner.algorithm.local_models import ClassModel
+from t6gps.learner.algorithm.model_series import ModelSeries
+from t6gps.learner.algorithm.segments import ClassKey, SegmentGroup, Segments
+from t6gps.learner.improvers.improver import Improved
+from t6gps.learner.port import Report, Row
+from t6gps.learner.rows import NONE, Floats, Ints, Rows, pieces, root_mean_square
 
 
 @dataclass(frozen=True)
@@ -26,97 +31,113 @@ class Segmented:
 class Fitted:
     """Models of the groups with a dynamics sample, by the group's position, and of each row."""
 
-    fits: dict[int, surrogate.ClassModel]
-    patch: surrogate.Patch
-
-
-@dataclass(frozen=True)
-class Improved:
-    """Improved actions [n, nu] and the predicted change of the running cost that follows [n]; NaN without a sample."""
-
-    action: NDArray[np.float32]
-    predicted_cost_change: NDArray[np.float32]
-    sub_trajectories: int
+    fits: dict[int, ClassModel]
+    series: ModelSeries
 
 
 @dataclass(frozen=True)
 class Trained:
-    """Loss of the S-step and the commands of the new policy at every row [n, nu], without noise (m)."""
+    """Loss of the S-step, and KL divergence of the new policy from the one that acted [n] (nat)."""
 
     loss: supervised.Loss
-    action_mean: NDArray[np.float32]
+    kl: Floats
 
 
-def iteration_row(
-    segmented: Segmented, fitted: Fitted, improved: Improved, trained: Trained, command_range_m: tuple[float, float]
-) -> dict[str, Any]:
-    """The learner's columns of `iterations`."""
-    rows = segmented.rows
-    modes = np.concatenate([fit.modes[fit.modes > 0] for fit in fitted.fits.values()])
-    mean, (low, high) = rows.action_mean[rows.acts], np.asarray(command_range_m, dtype=np.float32)
-    return {
-        "segments": len(segmented.segments.start),
-        "classes": sum(not group.pooled for group in segmented.groups),
-        "modes": float(modes.mean()),
-        "residual": float(np.nanmean(fitted.patch.residual)),
-        "sub_trajectories": improved.sub_trajectories,
-        "predicted_cost_change": _mean(improved.predicted_cost_change[rows.continues]),
-        "action_change_m": root_mean_square((improved.action - rows.action_mean)[rows.continues]),
-        "supervised_loss_before": trained.loss.before,
-        "supervised_loss": trained.loss.after,
-        "policy_kl": _mean(_kl(rows, trained)[rows.acts]),
-        "saturated_share": float(((mean <= low) | (mean >= high)).mean()),
-    }
+@dataclass(frozen=True)
+class Iteration:
+    """What the phases of an iteration have found."""
+
+    segmented: Segmented
+    fitted: Fitted
+    improved: Improved
+    trained: Trained
 
 
-def class_rows(
-    segmented: Segmented,
-    fitted: Fitted,
-    improved: Improved,
-    trained: Trained,
+def report(
+    results: Iteration,
+    iteration: int,
+    command_range_m: tuple[float, float],
     target_speed_m_per_s: float,
     vertical_weight: float,
-) -> list[dict[str, Any]]:
-    """The rows of `classes`, without the iteration."""
-    rows, segments = segmented.rows, segmented.segments
-    lengths, kl, found = segments.stop - segments.start, _kl(rows, trained), []
+) -> Report:
+    """The learner's columns of `iterations` and the rows of `classes`."""
+    rows = results.segmented.rows
     cost_after = np.roll(cost.running_cost(rows.state, rows.target, target_speed_m_per_s, vertical_weight), -1)
-    for number, group in enumerate(segmented.groups):
-        fit = fitted.fits.get(number)
-        for key, members in group.classes.items():
-            own = np.isin(segments.of_row, members)
-            sampled = own & rows.continues
-            found.append(
-                {
-                    "kind": key.kind,
-                    "entry_edge": None if key.entry == NONE else key.entry,
-                    "exit_edge": None if key.exit == NONE else key.exit,
-                    "truncated": key.truncated,
-                    "segments": len(members),
-                    "rows": int(lengths[members].sum()),
-                    "time_steps": warping.class_steps(lengths[group.segments], group.key.exit != NONE),
-                    "pooled": group.pooled,
-                    "modes": float(fit.modes[fit.modes > 0].mean()) if fit else 0.0,
-                    "residual": _mean(fitted.patch.residual[sampled]) if sampled.any() else 0.0,
-                    "cost": _mean(cost_after[own]),
-                    "predicted_cost_change": _mean(improved.predicted_cost_change[sampled]) if sampled.any() else None,
-                    "policy_kl": _mean(kl[own]),
-                }
-            )
-    return found
+    classes = _class_rows(results, cost_after)
+    return Report(_iteration_row(results, command_range_m), [{"iteration": iteration, **row} for row in classes])
 
 
-def _kl(rows: Rows, trained: Trained) -> NDArray[np.float32]:
-    """KL divergence of the new policy from the one that acted, both with the exploration variance [n] (nat)."""
-    variance = root_mean_square((rows.action - rows.action_mean)[rows.acts]) ** 2
-    change = trained.action_mean - rows.action_mean
-    divergence: NDArray[np.float32] = np.square(change).sum(axis=1) / (2 * max(variance, lqg.ACTION_VARIANCE_FLOOR_M2))
+def kl(rows: Rows, part: Ints, action_mean: Floats, exploration_variance_m2: float) -> Floats:
+    """KL divergence at rows [m] of a policy with noise-free commands [m, nu] from the one that acted [m] (nat).
+
+    Both have the exploration variance.
+    """
+    change = action_mean - rows.action_mean[part]
+    divergence: Floats = np.square(change).sum(axis=1) / (2 * max(exploration_variance_m2, ACTION_VARIANCE_FLOOR_M2))
     return divergence
 
 
-def root_mean_square(values: NDArray[np.float32]) -> float:
-    """Root of the mean square of all entries."""
-    return float(np.sqrt(np.mean(np.square(values, dtype=np.float64))))
+def _iteration_row(results: Iteration, command_range_m: tuple[float, float]) -> Row:
+    rows, improved, loss = results.segmented.rows, results.improved, results.trained.loss
+    modes = np.concatenate([fit.modes[fit.modes > 0] for fit in results.fitted.fits.values()])
+    sampled = np.flatnonzero(rows.continues)
+    return {
+        "segments": len(results.segmented.segments.start),
+        "classes": sum(not group.pooled for group in results.segmented.groups),
+        "modes": float(modes.mean()),
+        "residual": float(np.nanmean(results.fitted.series.residual)),
+        "sub_trajectories": improved.sub_trajectories,
+        "predicted_cost_change": _mean(improved.predicted_cost_change[rows.continues]),
+        "action_change_m": root_mean_square(sampled, lambda part: improved.action[part] - rows.action_mean[part]),
+        "supervised_loss_before": loss.before,
+        "supervised_loss": loss.after,
+        "policy_kl": _mean(results.trained.kl[rows.acts]),
+        "saturated_share": _saturated_share(rows, command_range_m),
+    }
+
+
+def _saturated_share(rows: Rows, command_range_m: tuple[float, float]) -> float:
+    """Share of noise-free commands at an end of the command range."""
+    low, high = np.asarray(command_range_m, dtype=np.float32)
+    acting, saturated_n = np.flatnonzero(rows.acts), 0
+    for part in pieces(acting):
+        mean = rows.action_mean[part]
+        saturated_n += int(((mean <= low) | (mean >= high)).sum())
+    return saturated_n / (len(acting) * rows.action_mean.shape[1])
+
+
+def _class_rows(results: Iteration, cost_after: NDArray[np.floating]) -> list[Row]:
+    """The rows of `classes`, without the iteration."""
+    return [
+        _class_row(results, cost_after, number, key, members)
+        for number, group in enumerate(results.segmented.groups)
+        for key, members in group.classes.items()
+    ]
+
+
+def _class_row(results: Iteration, cost_after: NDArray[np.floating], number: int, key: ClassKey, members: Ints) -> Row:
+    """The row of a class: segments `members` of the group of that number."""
+    rows, segments = results.segmented.rows, results.segmented.segments
+    group, fit = results.segmented.groups[number], results.fitted.fits.get(number)
+    lengths = segments.stop - segments.start
+    within = np.isin(segments.of_row, members)
+    sampled = within & rows.continues
+    change = results.improved.predicted_cost_change[sampled]
+    return {
+        "kind": key.kind,
+        "entry_edge": None if key.entry == NONE else key.entry,
+        "exit_edge": None if key.exit == NONE else key.exit,
+        "truncated": key.truncated,
+        "segments": len(members),
+        "rows": int(lengths[members].sum()),
+        "time_steps": warping.class_steps(lengths[group.segments], group.key.exit != NONE),
+        "pooled": group.pooled,
+        "modes": float(fit.modes[fit.modes > 0].mean()) if fit else 0.0,
+        "residual": _mean(results.fitted.series.residual[sampled]) if sampled.any() else 0.0,
+        "cost": _mean(cost_after[within]),
+        "predicted_cost_change": _mean(change) if sampled.any() else None,
+        "policy_kl": _mean(results.trained.kl[within]),
+    }
 
 
 def _mean(values: NDArray[np.floating]) -> float:

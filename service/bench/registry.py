@@ -14,6 +14,7 @@ from t6gps.service.provenance import Provenance, provenance
 from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
+    "growth": "t6gps.service.bench.learner",
     "learner": "t6gps.service.bench.learner",
     "physics": "t6gps.workers.bench.physics",
     "pool": "t6gps.service.bench.pool",

@@ -8,13 +8,12 @@ from __future__ import annotations
 
 import logging
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from enum import StrEnum
 from pathlib import Path
-from typing import Any, Protocol
 
-from numpy.typing import NDArray
-
+from t6gps.learner.phases import Phase
+from t6gps.learner.port import LearnerPort, Progress
 from t6gps.service.config import Config
 from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.ledger import Ledger
@@ -22,8 +21,6 @@ from t6gps.service.pool.state import RunState
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 
-PHASES = ("segment", "fit", "backward_pass", "supervise")
-"""Phases of the learner in their order (paper Alg. 2, lines 3, 4-7, 8-12 and 13)."""
 Keep = Callable[[Episode], None]
 """Makes an episode durable: when it returns, the episode survives a crash and counts."""
 _log = logging.getLogger(__name__)
@@ -34,23 +31,6 @@ class Purpose(StrEnum):
 
     TRAINING = "episode"
     EVALUATION = "evaluation"
-
-
-class LearnerPort(Protocol):
-    """What is asked of a learner between its phases; `learner.Learner` says what each method does.
-
-    LearnerDiedError when the learner's process is gone.
-    """
-
-    def policy(self, version: int | None = None) -> PolicySnapshot: ...
-
-    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]: ...
-
-    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]: ...
-
-    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None: ...
-
-    def recall(self, run: Run) -> None: ...
 
 
 class Executor(ABC):
@@ -69,7 +49,7 @@ class Executor(ABC):
     @property
     @abstractmethod
     def learner(self) -> LearnerPort:
-        """The learner, started when it is first needed."""
+        """The learner, started when it is first needed; LearnerDiedError when its process is gone."""
 
     @abstractmethod
     def sample(
@@ -104,8 +84,8 @@ class Executor(ABC):
         """Give the learner episodes that lie in the spool already: sampled ahead, or before a restart."""
 
     @abstractmethod
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        """Run one of PHASES; yields (done, total)."""
+    def learn(self, phase: Phase) -> Progress:
+        """Run a phase of the learner; yields (done, total)."""
 
     @abstractmethod
     def replace_learner(self) -> None:

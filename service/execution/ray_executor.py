@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import signal
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import ray
 
+from t6gps.learner.phases import Phase
+from t6gps.learner.port import Progress
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.ray_learner import RayLearner
@@ -95,8 +97,8 @@ class RayExecutor(Executor):
     def feed_spooled(self, files: Sequence[Path]) -> None:
         self.learner.add_spooled(files)
 
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        self.pool.phase = phase
+    def learn(self, phase: Phase) -> Progress:
+        self.pool.phase = phase.name
         return self.learner.learn(phase)
 
     def replace_learner(self) -> None:

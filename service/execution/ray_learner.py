@@ -9,13 +9,15 @@ from __future__ import annotations
 import math
 import time
 from collections import deque
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 import ray
-from numpy.typing import NDArray
 
+from t6gps.learner.phases import Phase
+from t6gps.learner.port import LearnerState, Manifest, Progress, Report
+from t6gps.learner.rows import AnyArray
 from t6gps.service.config import Config
 from t6gps.service.pool import control
 from t6gps.service.ray_backend.cluster import start_actor
@@ -47,10 +49,10 @@ class LearnerActor:
         for file in files:
             self._learner.add(spool.read(file).frames)
 
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
+    def learn(self, phase: Phase) -> Progress:
         """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""
         told_s = -math.inf
-        for done, total in getattr(self._learner, phase)():
+        for done, total in getattr(self._learner, phase.name)():
             if done == total or time.monotonic() - told_s >= control.TICK_S:
                 told_s = time.monotonic()
                 yield done, total
@@ -58,13 +60,13 @@ class LearnerActor:
     def policy(self, version: int | None) -> PolicySnapshot:
         return self._learner.policy(version)
 
-    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
+    def report(self) -> Report:
         return self._learner.report()
 
-    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
+    def state(self) -> LearnerState:
         return self._learner.state()
 
-    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    def restore(self, manifest: Manifest, arrays: Mapping[str, AnyArray]) -> None:
         self._learner.restore(manifest, arrays)
 
     def recall(self, run: Run) -> None:
@@ -95,7 +97,7 @@ class RayLearner:
         """Let it read episodes from the spool, while others are sampled; `learn` asks how it went."""
         self._taken.append(self.actor.add_spooled.remote(files))
 
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
+    def learn(self, phase: Phase) -> Progress:
         """Run a phase; yields (done, total)."""
         if self._taken:
             self._until_done(self._taken[-1])
@@ -114,15 +116,15 @@ class RayLearner:
         snapshot: PolicySnapshot = self._answer(self.actor.policy.remote(version))
         return snapshot
 
-    def report(self) -> tuple[dict[str, Any], list[dict[str, Any]]]:
-        rows: tuple[dict[str, Any], list[dict[str, Any]]] = self._answer(self.actor.report.remote())
+    def report(self) -> Report:
+        rows: Report = self._answer(self.actor.report.remote())
         return rows
 
-    def state(self) -> tuple[dict[str, Any], dict[str, NDArray[Any]]]:
-        state: tuple[dict[str, Any], dict[str, NDArray[Any]]] = self._answer(self.actor.state.remote())
+    def state(self) -> LearnerState:
+        state: LearnerState = self._answer(self.actor.state.remote())
         return state
 
-    def restore(self, manifest: dict[str, Any], arrays: dict[str, NDArray[Any]]) -> None:
+    def restore(self, manifest: Manifest, arrays: Mapping[str, AnyArray]) -> None:
         self._answer(self.actor.restore.remote(manifest, arrays))
 
     def recall(self, run: Run) -> None:
@@ -168,7 +170,7 @@ def _task_map(width: int) -> Callable[..., Iterator[Any]]:
     a pipelined run.
     """
 
-    def task_map(function: Callable[[Any], Any], jobs: Sequence[Any]) -> Iterator[Any]:
+    def task_map(function: Callable[[Any], Any], jobs: Iterable[Any]) -> Iterator[Any]:
         task = ray.remote(num_cpus=0, max_retries=3)(function)
         pending: deque[Any] = deque()
         for job in jobs:

@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from t6gps.learner.learner import Learner
+from t6gps.learner.phases import Phase
+from t6gps.learner.port import Progress
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.wiring import new_learner
@@ -68,8 +70,8 @@ class SerialExecutor(Executor):
         for file in files:
             self._learner.add(spool.read(file).frames)
 
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        yield from getattr(self._learner, phase)()
+    def learn(self, phase: Phase) -> Progress:
+        yield from getattr(self._learner, phase.name)()
 
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)

@@ -15,36 +15,22 @@ import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
 
+from t6gps.learner.phases import PHASES
+from t6gps.learner.port import Manifest
 from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.execution.executor import PHASES, Executor
+from t6gps.service.execution.executor import Executor
 from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.checkpoint import JSON
 from t6gps.storage.errors import LearnerDiedError, RunError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import Spool, read
-
-PHASE_TITLES = {
-    "sample": "sampling",
-    "segment": "segmenting",
-    "fit": "fitting",
-    "backward_pass": "backward pass",
-    "supervise": "supervised step",
-    "evaluate": "evaluation",
-}
-DURATION_COLUMNS = {
-    "sample": "sampling_s",
-    "segment": "segmenting_s",
-    "fit": "fitting_s",
-    "backward_pass": "backward_pass_s",
-    "supervise": "supervised_s",
-}
-
 
 LEARNER_DEATHS_ALLOWED_N = 3
 """So many in one iteration."""
@@ -72,7 +58,7 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
             latest = checkpoint.load_latest(run.checkpoints)
             if latest is not None:
                 first, manifest, arrays = latest
-                executor.learner.restore(manifest, arrays)
+                executor.learner.restore(cast(Manifest, manifest), arrays)
                 executor.learner.recall(run)
                 if not resumed:
                     executor.ledger.restore(manifest.get("ledger"))
@@ -109,7 +95,7 @@ def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
 
 def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
     durations: dict[str, float] = {}
-    with _timed(durations, "sample"):
+    with _timed(durations, "sampling_s"):
         spool = Spool(run.spool, iteration)
         batch = _batch(config, executor, spool)
         plans, kept = batch.plans, batch.kept
@@ -129,17 +115,18 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
     if config.run.pipelined and iteration + 1 < config.run.iterations:
         _sample_ahead(config, run, executor, iteration + 1)
     for phase in PHASES:
-        with _timed(durations, phase):
+        with _timed(durations, phase.duration_column):
             for done, total in executor.learn(phase):
-                observer.progress(iteration, phase, done, total)
+                observer.progress(iteration, phase.name, done, total)
     learned, classes = executor.learner.report()
     summaries = pa.concat_tables([read(path).summary for path in files]).combine_chunks()
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
     row |= _sampled(summaries) | learned | durations
     row["left_out"] = len(plans) - len(files)
     tables.commit_iteration(run, iteration, map(read, files), row, classes)
-    manifest, arrays = executor.learner.state()
-    checkpoint.save(run.checkpoints, iteration + 1, manifest | {"ledger": executor.ledger.state()}, arrays)
+    state = executor.learner.state()
+    manifest = cast(dict[str, JSON], {**state.manifest, "ledger": executor.ledger.state()})
+    checkpoint.save(run.checkpoints, iteration + 1, manifest, state.arrays)
     spool.clear()
     observer.finished(row)
 
@@ -151,10 +138,10 @@ def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) 
 
 
 @contextmanager
-def _timed(durations: dict[str, float], phase: str) -> Iterator[None]:
+def _timed(durations: dict[str, float], column: str) -> Iterator[None]:
     start = time.perf_counter()
     yield
-    durations[DURATION_COLUMNS[phase]] = time.perf_counter() - start
+    durations[column] = time.perf_counter() - start
 
 
 def _sampled(summary: pa.Table) -> dict[str, Any]:

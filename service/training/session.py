@@ -6,8 +6,9 @@ import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from enum import StrEnum
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, cast
 
+from t6gps.learner.port import Manifest
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
@@ -110,5 +111,6 @@ def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BUL
     if latest is None:
         raise RunError(f"run {run.name} has no checkpoint yet; let it finish an iteration")
     executor = start_executor(config, serial, engine=engine)
-    executor.learner.restore(*latest[1:])
+    _, manifest, arrays = latest
+    executor.learner.restore(cast(Manifest, manifest), arrays)
     return executor

@@ -24,19 +24,13 @@ from rich.progress import (
 )
 from rich.table import Table
 
+from t6gps.learner.phases import PHASES
 from t6gps.service.training.evaluation import EVALUATED, Evaluation
 
 console = Console(stderr=True)
 """Progress and messages go to stderr, results to stdout, so that results can be piped."""
 
-PHASE_TITLES = {
-    "sample": "sampling",
-    "segment": "segmenting",
-    "fit": "fitting",
-    "backward_pass": "backward pass",
-    "supervise": "supervised step",
-    "evaluate": "evaluation",
-}
+PHASE_TITLES = {"sample": "sampling", **{phase.name: phase.title for phase in PHASES}, "evaluate": "evaluation"}
 """What the bar of each phase says."""
 
 LEARNING_COLUMNS = {

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from typing import Any
 
 import numpy as np
@@ -10,10 +10,14 @@ import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
 
-from t6gps.learner.features import Rows, read_rows
+from t6gps.learner.algorithm.features import Canonical
+from t6gps.learner.algorithm.segments import Segments, classify
+from t6gps.learner.episodes import Episodes
 from t6gps.learner.learner import Learner
+from t6gps.learner.phases import PHASES
 from t6gps.learner.policy import initial
-from t6gps.learner.settings import LearnerSettings
+from t6gps.learner.rows import Rows
+from t6gps.learner.settings import LearnerSettings, ReducedState
 from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
 
@@ -31,6 +35,16 @@ def frames_table(columns: dict[str, Any], rows: int) -> pa.Table:
             values = [0] * rows if length is None else np.zeros((rows, length), dtype=np.float32)
         arrays.append(pa.array(list(values), type=field.type))
     return schema.check(pa.Table.from_arrays(arrays, schema=schema.FRAMES), schema.FRAMES, "test episode")
+
+
+def stay_table(stays: list[tuple[int, int, int | None, int | None]]) -> pa.Table:
+    """One episode of stays (face, rows, entry, exit), kind 0; the last row has no action."""
+    face = [face for face, rows, _, _ in stays for _ in range(rows)]
+    entry = [entry for _, rows, entry, _ in stays for _ in range(rows)]
+    exit_ = [exit_ if row == rows - 1 else None for _, rows, _, exit_ in stays for row in range(rows)]
+    actions = [np.zeros(24)] * (len(face) - 1) + [None]
+    columns = {"face": face, "entry_edge": entry, "exit_edge": exit_, "action": actions, "action_mean": actions}
+    return frames_table(columns, len(face))
 
 
 class HybridWorld:
@@ -131,14 +145,42 @@ def tables(world: HybridWorld, untrained: PolicySnapshot) -> list[pa.Table]:
     return world.episodes(untrained, episodes=12, steps=80, seed=2)
 
 
+def rows_and_segments(
+    tables: Iterable[pa.Table], reduced_state: ReducedState = "nodes", longest_steps: int = 20
+) -> tuple[Rows, Segments]:
+    """Rows and segments of episodes as the learner makes them."""
+    reading = Canonical(reduced_state)
+    episodes = Episodes([reading], longest_steps)
+    for table in tables:
+        episodes.add(table.column("episode_id")[0].as_py(), table)
+    columns, pieces = episodes.joined()
+    rows = reading.rows(columns)
+    return rows, classify(rows, pieces)
+
+
+@pytest.fixture(scope="session")
+def read() -> Callable[..., tuple[Rows, Segments]]:
+    return rows_and_segments
+
+
 @pytest.fixture(scope="session")
 def rows(tables: list[pa.Table]) -> Rows:
-    return read_rows(dict(enumerate(tables)), "nodes")
+    return rows_and_segments(tables)[0]
+
+
+@pytest.fixture(scope="session")
+def segments(tables: list[pa.Table]) -> Segments:
+    return rows_and_segments(tables)[1]
 
 
 @pytest.fixture(scope="session")
 def make_frames() -> Callable[..., pa.Table]:
     return frames_table
+
+
+@pytest.fixture(scope="session")
+def make_stays() -> Callable[..., pa.Table]:
+    return stay_table
 
 
 @pytest.fixture
@@ -168,7 +210,7 @@ def iterate() -> Callable[[Learner, list[pa.Table]], None]:
     def run(learner: Learner, tables: list[pa.Table]) -> None:
         for table in tables:
             learner.add(table)
-        for phase in (learner.segment, learner.fit, learner.backward_pass, learner.supervise):
-            assert all(0 <= done <= total for done, total in phase())
+        for phase in PHASES:
+            assert all(0 <= done <= total for done, total in getattr(learner, phase.name)())
 
     return run

@@ -1,27 +1,23 @@
-"""Laws of one iteration: surrogate models in place, order, determinism, restoring, and improvement."""
+"""Laws of one iteration: order, determinism, restoring, and improvement."""
 
 from __future__ import annotations
 
-import pickle
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import policy, surrogate
+from t6gps.learner import policy
 from t6gps.learner.cost import running_cost
-from t6gps.learner.features import NONE, Rows, read_rows
 from t6gps.learner.learner import Learner
-from t6gps.learner.modes import FitOptions
-from t6gps.learner.segments import cut, group
+from t6gps.learner.rows import Rows
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.storage import schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError
 from t6gps.storage.records import PolicySnapshot
 
-OPTIONS = FitOptions(modes=4, residual_threshold=1.0, prior_samples=100.0, ridge=1e-3)
 Iterate = Callable[[Learner, list[pa.Table]], None]
 
 
@@ -29,61 +25,11 @@ def weights(snapshot: PolicySnapshot) -> bytes:
     return b"".join(part.tobytes() for layer in snapshot.layers for part in layer)
 
 
-@pytest.fixture(scope="module")
-def jobs(rows: Rows) -> dict[int, surrogate.ClassJob]:
-    segments = cut(rows, 20)
-    return surrogate.jobs(rows, segments, group(segments, 10), OPTIONS, run_seed=1, iteration=0)
-
-
-def test_every_dynamics_sample_lies_in_exactly_one_bin(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
-    taken = np.concatenate([job.rows for job in jobs.values()])
-    assert np.array_equal(np.sort(taken), np.flatnonzero(rows.continues))
-    for job in jobs.values():
-        assert job.step.min() >= 0 and job.step.max() < job.steps
-
-
-def test_crossings_are_alone_in_their_bins(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
-    for job in jobs.values():
-        crossing = rows.exit[job.rows] != NONE
-        assert np.array_equal(crossing, (job.step == job.steps - 1) & job.crosses)
-
-
-def test_the_models_of_a_row_lead_to_the_next_row(rows: Rows, jobs: dict[int, surrogate.ClassJob]) -> None:
-    fits = [surrogate.fit_class(job) for job in jobs.values()]
-    patch = surrogate.patch(list(jobs.values()), fits, len(rows.acts))
-    assert np.array_equal(patch.of_row != NONE, rows.continues)
-    index = np.flatnonzero(rows.continues)
-    F, f = patch.models.F[patch.of_row[index]], patch.models.f[patch.of_row[index]]
-    z = np.hstack([rows.state, rows.action])[index]
-    error = (F @ z[:, :, None])[:, :, 0] + f - rows.state[index + 1]
-    spread = rows.state[index + 1].std(axis=0)
-    assert np.sqrt((error**2).mean(axis=0)).max() < 0.5 * spread.max()
-    assert np.nanmean(patch.residual) < 0.4
-
-
-def test_fits_give_identical_bytes_in_any_order_and_after_pickling(jobs: dict[int, surrogate.ClassJob]) -> None:
-    forward = {number: surrogate.fit_class(job) for number, job in jobs.items()}
-    for number in reversed(jobs):
-        again = surrogate.fit_class(pickle.loads(pickle.dumps(jobs[number])))
-        assert pickle.dumps(again) == pickle.dumps(forward[number])
-
-
-def test_seeds_of_all_jobs_differ_and_change_with_run_and_iteration(rows: Rows) -> None:
-    segments = cut(rows, 20)
-    groups = group(segments, 10)
-    seen = {
-        (job.entropy, job.branch)
-        for run_seed, iteration in ((1, 0), (2, 0), (1, 1))
-        for job in surrogate.jobs(rows, segments, groups, OPTIONS, run_seed, iteration).values()
-    }
-    assert len(seen) == 3 * len(groups)
-
-
 def test_the_order_of_arrival_and_of_fitting_does_not_matter(
     tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
 ) -> None:
-    def backwards(function: Callable[[Any], Any], items: Sequence[Any]) -> Iterator[Any]:
-        return iter([function(item) for item in reversed(items)][::-1])
+    def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
+        return iter([function(item) for item in reversed(list(items))][::-1])
 
     one, other = make_learner(), make_learner(fit_map=backwards)
     iterate(one, tables)
@@ -145,6 +91,8 @@ def test_phases_out_of_order_and_repeated_episodes_are_refused(
     learner.add(tables[0])
     with pytest.raises(DataError, match="twice"):
         learner.add(tables[0])
+    with pytest.raises(RunError, match=r"supervise\(\) must come first"):
+        learner.report()
 
 
 def test_the_report_fills_the_columns_of_its_tables(
@@ -163,12 +111,11 @@ def test_the_report_fills_the_columns_of_its_tables(
 
 
 def test_the_report_of_an_iteration_is_the_mean_of_its_classes_over_their_rows(
-    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate
+    tables: list[pa.Table], rows: Rows, make_learner: Callable[..., Learner], iterate: Iterate
 ) -> None:
-    learner = make_learner()
+    learner, episodes = make_learner(), rows
     iterate(learner, tables)
     iteration, classes = learner.report()
-    episodes = read_rows(dict(enumerate(tables)), "nodes")
     change = policy.act(learner.snapshot, episodes.observation).clip(0.65, 1.35) - episodes.action_mean
     variance = np.nanmean((episodes.action - episodes.action_mean) ** 2)
     assert iteration["policy_kl"] == pytest.approx(np.nanmean((change**2).sum(axis=1)) / 2 / variance, rel=1e-4)

@@ -7,7 +7,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from t6gps.learner import value
+from t6gps.learner.improvers import action_value as value
+from t6gps.learner.phases import PHASES, Phase
 from t6gps.service.config import Config, load
 from t6gps.service.execution.executor import Keep, Purpose
 from t6gps.service.execution.serial import SerialExecutor
@@ -25,6 +26,9 @@ TINY = [
     "learner.replay_iterations=1",
     "learner.hidden_layers=[16]",
 ]
+
+
+PHASES_BY_NAME = {phase.name: phase for phase in PHASES}
 
 
 class Silent:
@@ -62,9 +66,9 @@ class StopsAfter(SerialExecutor):
             self._episodes = None if self._episodes is None else self._episodes - 1
             super().sample([plan], snapshot, keep, purpose)
 
-    def learn(self, phase: str) -> Iterator[tuple[int, int]]:
-        self._learned += phase == "segment"
-        if phase == self._phase and self._learned == 2:
+    def learn(self, phase: Phase) -> Iterator[tuple[int, int]]:
+        self._learned += phase.name == "segment"
+        if phase.name == self._phase and self._learned == 2:
             raise KeyboardInterrupt
         return super().learn(phase)
 
@@ -104,11 +108,11 @@ def uninterrupted(config: Config, tmp_path_factory: pytest.TempPathFactory) -> R
     this = catalog.create(tmp_path_factory.mktemp("runs"), "whole", config.to_json())
     observer = trained(config, this, SerialExecutor(config))
     assert [row["iteration"] for row in observer.rows] == [0, 1, 2]
-    assert observer.phases == {"sample", *loop.PHASES}
+    assert observer.phases == {"sample", *PHASES_BY_NAME}
     return this
 
 
-@pytest.mark.parametrize("stop", [{"episodes": 0}, {"episodes": 4}, *({"phase": phase} for phase in loop.PHASES)])
+@pytest.mark.parametrize("stop", [{"episodes": 0}, {"episodes": 4}, *({"phase": phase} for phase in PHASES_BY_NAME)])
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     config: Config, uninterrupted: Run, tmp_path: Path, stop: dict[str, Any]
 ) -> None:

@@ -6,11 +6,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.learner import standard_gps
-from t6gps.learner.features import NONE
+from t6gps.learner.alternatives import standard_gps
+from t6gps.learner.episodes import Episodes
+from t6gps.learner.phases import PHASES
+from t6gps.learner.rows import NONE, Rows
 from t6gps.service import seeding
 from t6gps.service.config import Config, load
-from t6gps.service.execution.serial import SerialExecutor
+from t6gps.service.execution.serial import SerialExecutor, new_learner
 from t6gps.storage import schema
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.records import Episode
@@ -49,8 +51,16 @@ def episodes(config: Config, executor: SerialExecutor) -> dict[int, pa.Table]:
     return {episode.episode_id: episode.frames for episode in sampled}
 
 
-def test_rows_are_in_world_axes(episodes: dict[int, pa.Table]) -> None:
-    rows = standard_gps.read_rows(episodes, CABLE_MAP)
+@pytest.fixture(scope="module")
+def rows(episodes: dict[int, pa.Table]) -> Rows:
+    reading = standard_gps.InWorld(CABLE_MAP)
+    taken = Episodes([reading], STEPS)
+    for number, frames in reversed(episodes.items()):
+        taken.add(number, frames)
+    return reading.rows(taken.joined()[0])
+
+
+def test_rows_are_in_world_axes(episodes: dict[int, pa.Table], rows: Rows) -> None:
     table = pa.concat_tables([episodes[key] for key in sorted(episodes)])
     element, yaw = schema.array(table, "element"), schema.array(table, "frame_yaw_rad")
     maps = world_map(element, yaw.astype(np.float64))
@@ -65,8 +75,7 @@ def test_rows_are_in_world_axes(episodes: dict[int, pa.Table]) -> None:
     assert len(set(element.tolist())) > 1
 
 
-def test_world_labels_and_canonical_labels_are_inverse(episodes: dict[int, pa.Table]) -> None:
-    rows = standard_gps.read_rows(episodes, CABLE_MAP)
+def test_world_labels_and_canonical_labels_are_inverse(episodes: dict[int, pa.Table], rows: Rows) -> None:
     table = pa.concat_tables([episodes[key] for key in sorted(episodes)])
     assert rows.labels is not None
     back = standard_gps.to_canonical(rows.action[rows.acts], rows.labels[rows.acts])
@@ -74,16 +83,15 @@ def test_world_labels_and_canonical_labels_are_inverse(episodes: dict[int, pa.Ta
 
 
 def test_every_direction_is_a_class_and_every_time_step_a_model(
-    executor: SerialExecutor, episodes: dict[int, pa.Table]
+    config: Config, episodes: dict[int, pa.Table], rows: Rows
 ) -> None:
-    rows = standard_gps.read_rows(episodes, CABLE_MAP)
     assert rows.entry.reshape(12, -1).tolist() == [[row] * (STEPS + 1) for row in rows.entry[:: STEPS + 1]]
     assert (rows.exit == NONE).all()
-    learner = executor._learner
+    learner = new_learner(config)
     for frames in episodes.values():
         learner.add(frames)
-    for phase in ("segment", "fit", "backward_pass", "supervise"):
-        list(executor.learn(phase))
+    for phase in PHASES:
+        list(getattr(learner, phase.name)())
     report, classes = learner.report()
     assert report["segments"] == 12
     assert [(row["entry_edge"], row["segments"], row["time_steps"]) for row in classes] == [

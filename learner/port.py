@@ -1,0 +1,59 @@
+"""What the service asks of a learner, and the records that it gets. Light: whoever unpacks them loads no torch."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Mapping
+from typing import NamedTuple, Protocol, TypedDict
+
+from t6gps.learner.rows import AnyArray
+from t6gps.storage.catalog import Run
+from t6gps.storage.records import PolicySnapshot
+
+Arrays = dict[str, AnyArray]
+Progress = Iterator[tuple[int, int]]
+"""(done, total) of a phase."""
+Row = dict[str, float | None]
+"""One row of a table, by column; flags and numbers of edges are among the numbers."""
+
+
+class Manifest(TypedDict):
+    """What a checkpoint says beside its arrays: version and output of the policy, numbers of layers and replays."""
+
+    version: int
+    offset_m: float
+    scale_m: float
+    layers: int
+    replays: int
+
+
+class LearnerState(NamedTuple):
+    """What the next iteration depends on, between two iterations."""
+
+    manifest: Manifest
+    arrays: Arrays
+
+
+class Report(NamedTuple):
+    """The learner's columns of `iterations`, and the rows of `classes`, of the iteration just finished."""
+
+    iteration: Row
+    classes: list[Row]
+
+
+class LearnerPort(Protocol):
+    """What is asked of a learner between its phases, whatever process it is in."""
+
+    def policy(self, version: int | None = None) -> PolicySnapshot:
+        """The policy of a version, the newest by default."""
+
+    def report(self) -> Report:
+        """What the iteration just finished adds to the tables."""
+
+    def state(self) -> LearnerState:
+        """What a checkpoint holds of the learner."""
+
+    def restore(self, manifest: Manifest, arrays: Mapping[str, AnyArray]) -> None:
+        """Continue from `state()`."""
+
+    def recall(self, run: Run) -> None:
+        """Read from a run's tables what the next iteration depends on beside `state()`."""
