@@ -1,8 +1,11 @@
-"""Renders the tables of measured figures: docs/figures/NAME.json into README.md and the pages of docs.
+"""Renders tables into README.md and the pages of docs: measured figures, and the states of workers and runs.
 
 A page says where a table goes; what stands between the two markers is replaced:
 
-    <!-- figures: NAME -->
+    <!-- figures: NAME -->      the measurement docs/figures/NAME.json
+    <!-- end -->
+
+    <!-- states: NAME -->       one of STATES, as the code has it: each member, its docstring, and what may follow
     <!-- end -->
 
 A file in docs/figures is one measurement:
@@ -20,22 +23,38 @@ Run as a program (`make docs`), it writes the pages anew.
 
 from __future__ import annotations
 
+import ast
+import inspect
 import json
 import os
 import re
 import textwrap
+from collections.abc import Mapping
+from enum import StrEnum
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
+
+from t6gps.service.pool.attempt import FailureKind
+from t6gps.service.pool.state import NEXT_PHASES, NEXT_STATES, Ending, RunState, WorkerPhase
 
 REPOSITORY = Path(__file__).parents[1]
 FIGURES = REPOSITORY / "docs" / "figures"
 MARKED = re.compile(r"<!-- figures: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
+MARKED_STATES = re.compile(r"<!-- states: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
+STATES: dict[str, tuple[type[StrEnum], Mapping[Any, set[Any]] | None]] = {
+    "worker": (WorkerPhase, NEXT_PHASES),
+    "run": (RunState, NEXT_STATES),
+    "failure": (FailureKind, None),
+    "ending": (Ending, None),
+}
+"""Enums by the name of their marker, with what may follow each member where that is limited."""
 PROVENANCE = ("command", "commit", "machine", "date")
 LINE_WIDTH = 120
 
 
 class FiguresError(Exception):
-    """A measurement that is missing or incomplete, or a marker that is never closed."""
+    """A measurement that is missing or incomplete, states that do not exist, or a marker that is never closed."""
 
 
 def pages() -> list[Path]:
@@ -93,12 +112,42 @@ def table(name: str, page: Path) -> str:
     return "\n".join([*lines, "", source])
 
 
+def meanings(kind: type[StrEnum]) -> dict[str, str]:
+    """The docstring of each member of an enum by the member's name, without its last full stop."""
+    definition = ast.parse(inspect.getsource(kind)).body[0]
+    assert isinstance(definition, ast.ClassDef), "an enum is a class"
+    texts = {}
+    for member, text in pairwise(definition.body):
+        match member, text:
+            case ast.Assign(targets=[ast.Name(id=name)]), ast.Expr(value=ast.Constant(value=str(words))):
+                texts[name] = " ".join(words.split()).rstrip(".")
+    return texts
+
+
+def states(name: str) -> str:
+    """The table of one of STATES in Markdown. FiguresError where there is no such name."""
+    if name not in STATES:
+        raise FiguresError(f"no states '{name}'; allowed: {', '.join(STATES)}; mend the marker")
+    kind, following = STATES[name]
+    texts = meanings(kind)
+    columns = [name, "meaning"] + ([] if following is None else ["may be followed by"])
+    lines = ["| " + " | ".join(columns) + " |", "|---" * len(columns) + "|"]
+    for member in kind:
+        cells = [f"`{member}`", texts.get(member.name, "")]
+        if following is not None:
+            cells.append(", ".join(f"`{other}`" for other in kind if other in following[member]) or "nothing")
+        lines.append("| " + " | ".join(cells) + " |")
+    return "\n".join(lines)
+
+
 def rendered(page: Path) -> str:
-    """The page's text with every marked table as its measurement says. FiguresError for a marker without an end."""
+    """The page's text, every marked table as measurements and code say. FiguresError for a marker without an end."""
     text = page.read_text(encoding="utf-8")
-    if text.count("<!-- figures: ") != len(MARKED.findall(text)):
-        raise FiguresError(f"{page}: a marker of figures has no end; close it with <!-- end -->")
-    return MARKED.sub(lambda mark: f"<!-- figures: {mark[1]} -->\n{table(mark[1], page)}\n<!-- end -->", text)
+    for what, marked in (("figures", MARKED), ("states", MARKED_STATES)):
+        if text.count(f"<!-- {what}: ") != len(marked.findall(text)):
+            raise FiguresError(f"{page}: a marker of {what} has no end; close it with <!-- end -->")
+    text = MARKED.sub(lambda mark: f"<!-- figures: {mark[1]} -->\n{table(mark[1], page)}\n<!-- end -->", text)
+    return MARKED_STATES.sub(lambda mark: f"<!-- states: {mark[1]} -->\n{states(mark[1])}\n<!-- end -->", text)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,4 @@
-"""Laws of measured figures: each stands once, in docs/figures, and pages repeat it."""
+"""Laws of rendered tables: measured figures stand once, in docs/figures, states in the code, and pages repeat them."""
 
 from __future__ import annotations
 
@@ -57,11 +57,33 @@ def test_a_marker_without_a_measurement_is_refused(render: ModuleType, tmp_path:
         render.rendered(page)
 
 
-def test_a_marker_without_an_end_is_refused(render: ModuleType, tmp_path: Path) -> None:
+@pytest.mark.parametrize("marker", ["figures: rough", "states: run"])
+def test_a_marker_without_an_end_is_refused(marker: str, render: ModuleType, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
-    page.write_text("<!-- figures: rough -->\n")
+    page.write_text(f"<!-- {marker} -->\n")
     with pytest.raises(render.FiguresError, match="no end"):
         render.rendered(page)
+
+
+def test_every_state_stands_on_a_page_with_what_may_follow_it(render: ModuleType) -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in render.pages())
+    assert {mark[1] for mark in render.MARKED_STATES.finditer(text)} == set(render.STATES)
+    for name, (kind, following) in render.STATES.items():
+        rows = [row.split(" | ") for row in render.states(name).splitlines()[2:]]
+        assert [row[0].strip("| `") for row in rows] == list(kind)
+        if following is not None:
+            named = [set(re.findall(r"`(\w+)`", row[2])) for row in rows]
+            assert named == [{str(state) for state in following[member]} for member in kind]
+
+
+def test_the_meaning_of_a_state_is_its_docstring(render: ModuleType) -> None:
+    kind, _ = render.STATES["failure"]
+    assert render.meanings(kind)["HANG"] == "No result before the deadline"
+
+
+def test_states_that_do_not_exist_are_refused(render: ModuleType) -> None:
+    with pytest.raises(render.FiguresError, match="no states 'weather'; allowed: worker, run"):
+        render.states("weather")
 
 
 def test_cells_show_every_digit_that_was_measured(render: ModuleType) -> None:

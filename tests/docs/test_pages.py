@@ -1,11 +1,16 @@
-"""Laws of the documents: what they link to and call exists, and they are short."""
+"""Laws of the documents: what they link to, call, import and name exists, and they are short."""
 
 from __future__ import annotations
 
+import ast
+import importlib
 import json
 import re
 import shlex
+import subprocess
+import tomllib
 from collections.abc import Iterator
+from fnmatch import fnmatch
 from itertools import pairwise
 from pathlib import Path
 
@@ -21,9 +26,12 @@ FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
 CONSOLE = re.compile(r"^ *```console\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 CODE = re.compile(r"`([^`]+)`")
 COMMIT = re.compile(r"\b(?=[0-9a-f]*\d)[0-9a-f]{7}\b")
-PAGES_WITH_COMMITS = {"docs/lab-notes.md", "docs/algorithm.md", "docs/reliability.md"}
+MODULE = re.compile(r"[\w./-]+\.py")
+TESTS = re.compile(r"([\w./-]+\.py)::(\w+\*?)")
+PYTHON = re.compile(r"^ *```python\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
+PAGES_WITH_COMMITS = {"docs/lab-notes.md", "docs/algorithm.md"}
 """The lab notes, and pages that are still to lose their commits."""
-SUMMARIES = ("README.md", "docs/results.md")
+SUMMARIES = ("README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/reliability.md", "docs/results.md")
 COMMAND: click.Command = typer.main.get_command(app)
 
 
@@ -100,6 +108,29 @@ def _sentences(text: str) -> list[str]:
     return [sentence for block in blocks for sentence in re.split(r"(?<=[.?!])[*\s]+(?=\S)", block) if sentence.strip()]
 
 
+def _imports(code: str) -> Iterator[tuple[str, str | None]]:
+    """Module of every import, and the name that is taken from it."""
+    for node in ast.walk(ast.parse(code)):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, None) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom) and node.module:
+            yield from ((node.module, alias.name) for alias in node.names)
+
+
+def _exists(module: str, name: str | None) -> bool:
+    try:
+        imported = importlib.import_module(module)
+        if name is not None and not hasattr(imported, name):
+            importlib.import_module(f"{module}.{name}")
+    except ImportError:
+        return False
+    return True
+
+
+def _functions(file: Path) -> list[str]:
+    return [node.name for node in ast.parse(file.read_text()).body if isinstance(node, ast.FunctionDef)]
+
+
 def _words(sentence: str) -> int:
     return sum(any(letter.isalnum() for letter in word) for word in sentence.split())
 
@@ -156,3 +187,53 @@ def test_sentences_of_the_summaries_are_short(page: str, pages: dict[str, str]) 
     lengths = [_words(sentence) for sentence in _sentences(pages[page])]
     assert sum(lengths) / len(lengths) <= 22
     assert max(lengths) <= 25
+
+
+@pytest.fixture(scope="module")
+def modules(repository: Path) -> list[str]:
+    """Paths of all modules that git tracks or would track."""
+    listed = ["git", "ls-files", "--cached", "--others", "--exclude-standard", "*.py"]
+    return subprocess.run(listed, cwd=repository, capture_output=True, text=True, check=True).stdout.split()
+
+
+def test_every_module_that_a_page_names_exists(pages: dict[str, str], modules: list[str]) -> None:
+    named = {(page, code) for page, text in pages.items() for code in CODE.findall(FENCE.sub("", text))}
+    missing = [
+        f"{page}: {code}"
+        for page, code in sorted(named)
+        if MODULE.fullmatch(code) and not any(f"/{module}".endswith(f"/{code}") for module in modules)
+    ]
+    assert not missing
+
+
+def test_every_test_that_a_page_names_exists(pages: dict[str, str], repository: Path) -> None:
+    named = {(page, *law) for page, text in pages.items() for law in TESTS.findall(text)}
+    assert any(page == "docs/reliability.md" for page, *_ in named)
+    missing = [
+        f"{page}: {file}::{pattern}"
+        for page, file, pattern in sorted(named)
+        if not any(fnmatch(name, pattern) for name in _functions(repository / file))
+    ]
+    assert not missing
+
+
+def test_every_import_in_code_on_a_page_works(pages: dict[str, str]) -> None:
+    wanted = {(page, *what) for page, text in pages.items() for code in PYTHON.findall(text) for what in _imports(code)}
+    assert not [
+        f"{page}: {module} {name or ''}" for page, module, name in sorted(wanted, key=str) if not _exists(module, name)
+    ]
+
+
+def test_the_architecture_names_every_room(pages: dict[str, str], repository: Path) -> None:
+    packages = tomllib.loads((repository / "pyproject.toml").read_text())["tool"]["setuptools"]["packages"]
+    folders = {package.removeprefix("t6gps.").replace(".", "/") for package in packages}
+    assert folders <= {code.rstrip("/") for code in CODE.findall(FENCE.sub("", pages["docs/architecture.md"]))}
+
+
+def test_the_newest_changes_are_those_of_the_version(repository: Path) -> None:
+    version = tomllib.loads((repository / "pyproject.toml").read_text())["project"]["version"]
+    newest = re.search(
+        r"^## \[(.+?)\] - 20\d\d-[01]\d-[0-3]\d$", (repository / "CHANGELOG.md").read_text(), re.MULTILINE
+    )
+    assert newest is not None
+    assert newest[1] == version
