@@ -22,8 +22,11 @@ class WorkerPhase(StrEnum):
     """What a worker does."""
 
     STARTING = "starting"
+    """Its process starts, or waits for a CPU."""
     IDLE = "idle"
+    """It waits for a plan."""
     SAMPLING = "sampling"
+    """It runs an episode."""
     DRAINING = "draining"
     """It finishes its episode and gets no other."""
     ENDING = "ending"
@@ -44,8 +47,11 @@ class Ending(StrEnum):
     """Why a worker ends; the values are the names of the counters."""
 
     CRASH = "crashed"
+    """Its process ended by itself."""
     HANG = "hung"
+    """A deadline passed."""
     DRAINED = "drained"
+    """It was not needed any more."""
 
 
 class RunState(StrEnum):
@@ -60,8 +66,9 @@ class RunState(StrEnum):
     STOPPING = "STOPPING"
     """Being stopped."""
     STOPPED = "STOPPED"
-    """Its process has ended and the run is not done; `--resume` goes on with it."""
+    """Its process has ended and the run is not done; `--resume` continues it."""
     DONE = "DONE"
+    """All iterations and the evaluation are kept."""
     FAILED = "FAILED"
     """The reason says why."""
 

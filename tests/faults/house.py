@@ -26,8 +26,8 @@ from t6gps.workers import stub
 from t6gps.workers.stub import StubWorker
 
 EPISODE_S, RUN = 0.1, "faults"
-QUICK = Timings(shortest_episode_s=2.0, policy_answer_s=1.5)
-"""Hangs are found after 2 s: the episodes take a tenth of a second."""
+QUICK = Timings(shortest_episode_s=3.0, policy_answer_s=1.5)
+"""Hangs are found after 3 s: the episodes take a tenth of a second."""
 CONFIG = {"run": {"episodes": 30, "steps": 20, "workers": 2, "cpus_per_worker": 0.5}}
 
 QUICK_HEALTH_CHECKS = {

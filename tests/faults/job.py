@@ -14,6 +14,7 @@ from pathlib import Path
 from house import House, policy
 
 from t6gps.service import seeding
+from t6gps.service.pool.deadlines import TIMINGS
 from t6gps.service.pool.state import RunState
 from t6gps.storage import catalog
 from t6gps.storage.spool import Spool
@@ -22,7 +23,7 @@ CONFIG = {"run": {"episodes": 60, "steps": 250, "workers": 1, "workers_min": 1, 
 
 
 def main(root: Path) -> None:
-    house = House(root, CONFIG)
+    house = House(root, CONFIG, TIMINGS)
     with catalog.locked(house.run), closing(house.executor) as executor:
         for iteration in count():
             spool = Spool(house.run.spool, iteration)
