@@ -17,9 +17,9 @@ from t6gps.service.training import evaluation
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
 from t6gps.storage import catalog, tables
-from t6gps.storage import query as sql_query
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.sql import query as sql_query
 
 EXPORT_SECTIONS = ("robot.", "terrain.")
 

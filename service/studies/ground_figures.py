@@ -33,7 +33,7 @@ from t6gps.service.views.run_figures import (
     numbers,
 )
 from t6gps.storage import tables
-from t6gps.storage.query import query
+from t6gps.storage.sql.query import query
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures import render

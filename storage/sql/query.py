@@ -15,9 +15,10 @@ import tempfile
 
 import pyarrow as pa
 
-from t6gps.storage import sandbox, tables
+from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import QueryError
+from t6gps.storage.sql import sandbox
 
 SQL_BYTES_N = 64 * 1024
 BRACKET_DEPTH_N = 100

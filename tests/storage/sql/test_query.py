@@ -8,10 +8,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from t6gps.storage import catalog, sandbox, schema, tables
+from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import QueryError
-from t6gps.storage.query import query
+from t6gps.storage.sql import sandbox
+from t6gps.storage.sql.query import query
 
 
 @pytest.fixture(scope="module")
@@ -151,7 +152,7 @@ def test_memory_is_bounded(empty: Run) -> None:
 
 
 def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
-    script = "from t6gps.storage import sandbox; sandbox._limit(1.0); print(len(bytes({bytes_n})))"
+    script = "from t6gps.storage.sql import sandbox; sandbox._limit(1.0); print(len(bytes({bytes_n})))"
     small, large = (
         subprocess.run(
             [sys.executable, "-c", script.format(bytes_n=bytes_n)], capture_output=True, text=True, check=False
@@ -171,7 +172,7 @@ def test_the_process_that_answers_loads_nothing_heavy() -> None:
     source = Path(sandbox.__file__).read_text(encoding="utf-8")
     assert "deltalake" not in source
     script = (
-        "import sys, t6gps.storage.sandbox\n"
+        "import sys, t6gps.storage.sql.sandbox\n"
         "print([name for name in ('torch', 'ray', 'pybullet', 'deltalake') if name in sys.modules])"
     )
     found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
