@@ -13,10 +13,8 @@ import numpy as np
 import pyarrow as pa
 
 from t6gps.learner.algorithm.segments import Pieces, cut, join
-from t6gps.learner.rows import AnyArray, Flags, Ints, Rows
+from t6gps.learner.rows import AnyArray, Columns, Ints, Rows
 from t6gps.storage.errors import DataError
-
-Columns = dict[str, AnyArray]
 
 BLOCK_BYTES = 2**26
 """Memory for many episodes' entries of a column.
@@ -121,13 +119,3 @@ class _Blocks:
             start = first[len(self._parts)]
             whole[start : start + len(part)] = part
         return whole
-
-
-def acting(frames: pa.Table) -> Flags:
-    """Which rows of an episode have an action [rows]: all but the last. DataError otherwise."""
-    nulls = frames.column("action").null_count
-    if nulls != 1 or frames.column("action")[-1].is_valid:
-        raise DataError(f"only the last row may lack an action, found {nulls} null actions")
-    acts = np.ones(frames.num_rows, dtype=bool)
-    acts[-1] = False
-    return acts

@@ -16,6 +16,8 @@ Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 AnyArray = NDArray[Any]
+Columns = dict[str, AnyArray]
+"""Entries of rows [n, ...] by the name of their column."""
 
 NONE = -1
 """Stands for an edge that is null in the table."""
