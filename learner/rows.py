@@ -10,17 +10,14 @@ from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
-
-from t6gps.storage.errors import DataError
 
 Floats = NDArray[np.float32]
 Ints = NDArray[np.int64]
 Flags = NDArray[np.bool_]
 AnyArray = NDArray[Any]
 Columns = dict[str, AnyArray]
-"""Columns of rows, by their names."""
+"""Entries of rows [n, ...] by the name of their column."""
 
 NONE = -1
 """Stands for an edge that is null in the table."""
@@ -83,13 +80,3 @@ def root_mean_square(chosen: Ints, values: Callable[[Ints], Floats]) -> float:
         squares = np.square(values(piece), dtype=np.float64)
         total, entries_n = total + squares.sum(), entries_n + squares.size
     return float(np.sqrt(total / entries_n))
-
-
-def acting(frames: pa.Table) -> Flags:
-    """Which rows of an episode have an action [rows]: all but the last. DataError otherwise."""
-    nulls = frames.column("action").null_count
-    if nulls != 1 or frames.column("action")[-1].is_valid:
-        raise DataError(f"only the last row may lack an action, found {nulls} null actions")
-    acts = np.ones(frames.num_rows, dtype=bool)
-    acts[-1] = False
-    return acts

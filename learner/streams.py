@@ -12,7 +12,14 @@ LEARNER = 1
 
 @unique
 class Stream(IntEnum):
-    """What a generator is for. No number comes twice: equal branches would draw equal numbers."""
+    """What a generator is for. No number comes twice: equal branches would draw equal numbers.
+
+    FITS           subsets of the mode search, one branch per class
+    SUPERVISED     order of the pairs
+    UNTRAINED      weights of the first policy, in iteration 0 alone
+    ACTION_VALUE   first weights of the action value, and the transitions that it learns from
+    CLUSTERS       centres of k-means, where samples are localised by clusters
+    """
 
     FITS = 0
     SUPERVISED = 1

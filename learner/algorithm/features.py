@@ -12,7 +12,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner.rows import NONE, VELOCITY_N, AnyArray, Columns, Flags, Floats, Ints, Rows, acting
+from t6gps.learner.rows import NONE, VELOCITY_N, AnyArray, Columns, Flags, Floats, Ints, Rows
 from t6gps.learner.settings import ReducedState
 from t6gps.storage import schema
 from t6gps.storage.errors import DataError
@@ -87,6 +87,16 @@ def _lower_nodes(state: Floats, kind: Ints) -> Floats:
         labels = np.sort(np.argsort(heights, kind="stable")[:LOWER_NODES_N])
         lower[chosen, VELOCITY_N:] = nodes[chosen][:, labels].reshape(len(chosen), -1)
     return lower
+
+
+def acting(frames: pa.Table) -> Flags:
+    """Which rows of an episode have an action [rows]: all but the last. DataError otherwise."""
+    nulls = frames.column("action").null_count
+    if nulls != 1 or frames.column("action")[-1].is_valid:
+        raise DataError(f"only the last row may lack an action, found {nulls} null actions")
+    acts = np.ones(frames.num_rows, dtype=bool)
+    acts[-1] = False
+    return acts
 
 
 def vectors(frames: pa.Table, name: str) -> Floats:

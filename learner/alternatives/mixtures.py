@@ -29,8 +29,8 @@ SMALLEST_VARIANCE = 1e-12
 def gaussian(bin_: Bin, options: FitOptions, rng: np.random.Generator) -> list[Mode]:
     """Modes from the components of a Gaussian mixture (in the place of `modes.ransac`)."""
     shrinkage = bin_.shrinkage
-    found = components(bin_.a, bin_.pooled, options.modes, shrinkage.prior_samples, shrinkage.ridge, rng)
-    return [fit(bin_, chosen, len(chosen)) for chosen in found]
+    members = components(bin_.a, bin_.pooled, options.modes, shrinkage.prior_samples, shrinkage.ridge, rng)
+    return [fit(bin_, chosen, len(chosen)) for chosen in members]
 
 
 def components(

@@ -17,8 +17,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.learner.algorithm.features import rows_of, spread
-from t6gps.learner.rows import NONE, Columns, Floats, Ints, Rows, acting
+from t6gps.learner.algorithm.features import acting, rows_of, spread
+from t6gps.learner.rows import NONE, Columns, Floats, Ints, Rows
 from t6gps.storage import schema
 
 Array = NDArray[np.float64]

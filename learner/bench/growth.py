@@ -33,6 +33,7 @@ def measure(
     learner_4x_steps         control steps of an iteration of four times the episodes
     learner_4x_seconds       the last of as many iterations as the action value remembers, from the first episode added
                              to the last phase
+    learner_4x_processor_s   processor time of that iteration on all threads, which other processes disturb less
     learner_4x_peak_mb       largest resident memory of the process in all of them, the libraries and the recorded
                              episodes, which it reads where they lie, included
 
@@ -46,28 +47,25 @@ def measure(
         lengths = [table.num_rows for table in episodes]
         for factor in factors:
             with ProcessPoolExecutor(1, mp_context=fresh) as process:
-                seconds, peak_mb = process.submit(_iterate, new_learner, path, lengths, factor).result()
+                measured = process.submit(_iterate, new_learner, path, lengths, factor).result()
             figures[f"learner_{factor}x_steps"] = factor * (sum(lengths) - len(lengths))
-            figures[f"learner_{factor}x_seconds"] = seconds
-            figures[f"learner_{factor}x_peak_mb"] = peak_mb
+            figures |= {f"learner_{factor}x_{name}": figure for name, figure in measured.items()}
     return figures
 
 
-def _iterate(
-    new_learner: Callable[[], Learner], path: Path, lengths: Sequence[int], factor: int
-) -> tuple[float, float]:
-    """Seconds of the last iteration and peak memory (MB)."""
+def _iterate(new_learner: Callable[[], Learner], path: Path, lengths: Sequence[int], factor: int) -> dict[str, float]:
+    """Seconds and processor time of the last iteration, and peak memory."""
     (recorded,) = ipc.unpack(pa.memory_map(str(path)), 1)
-    learner, seconds = new_learner(), 0.0
+    learner = new_learner()
     for _ in range(REMEMBERED_N):
-        start = time.perf_counter()
+        start, start_of_work = time.perf_counter(), time.process_time()
         for frames in _replicated(recorded, lengths, factor):
             learner.add(frames)
         for phase in PHASES:
             for _ in getattr(learner, phase.name)():
                 pass
-        seconds = time.perf_counter() - start
-    return seconds, resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024
+        spent = {"seconds": time.perf_counter() - start, "processor_s": time.process_time() - start_of_work}
+    return spent | {"peak_mb": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024}
 
 
 def _replicated(recorded: pa.Table, lengths: Sequence[int], factor: int) -> Iterator[pa.Table]:

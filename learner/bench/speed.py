@@ -119,8 +119,8 @@ def _fits_against_sklearn(plans: Sequence[ClassPlan], rows: Rows) -> dict[str, f
     for step in _class_steps(plans, rows):
         rng, first = np.random.default_rng(0), list[Flags]()
         ours_s += _seconds(partial(modes.fit_modes, step.samples, step.state_n, step.prior, step.options, rng))
-        found = sklearn_modes(step.samples, step.state_n, step.options)
-        reference_s += _seconds(partial(first.extend, found))
+        inliers = sklearn_modes(step.samples, step.state_n, step.options)
+        reference_s += _seconds(partial(first.extend, inliers))
         samples_n, reference_n = samples_n + len(step.samples), reference_n + int(first[0].sum())
         ours_n += int(first_mode_inliers(step).sum())
     return {

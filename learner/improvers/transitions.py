@@ -18,9 +18,9 @@ import pyarrow as pa
 import torch
 
 from t6gps.learner import policy
-from t6gps.learner.algorithm.features import spread, vectors
+from t6gps.learner.algorithm.features import acting, spread, vectors
 from t6gps.learner.episodes import Episodes
-from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, acting, pieces
+from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, pieces
 from t6gps.storage import schema
 from t6gps.storage.errors import RunError
 

@@ -31,11 +31,11 @@ def test_the_order_of_arrival_and_of_fitting_does_not_matter(
     def backwards(function: Callable[[Any], Any], items: Iterable[Any]) -> Iterator[Any]:
         return iter([function(item) for item in reversed(list(items))][::-1])
 
-    one, other = make_learner(), make_learner(fit_map=backwards)
-    iterate(one, tables)
-    iterate(other, tables[::-1])
-    assert weights(one.snapshot) == weights(other.snapshot)
-    assert one.report() == other.report()
+    forward, backward = make_learner(), make_learner(fit_map=backwards)
+    iterate(forward, tables)
+    iterate(backward, tables[::-1])
+    assert weights(forward.snapshot) == weights(backward.snapshot)
+    assert forward.report() == backward.report()
 
 
 def test_a_restored_learner_goes_on_with_identical_bytes(
@@ -59,8 +59,8 @@ def test_the_policy_before_the_newest_is_kept_where_it_is_asked_for_and_in_check
 ) -> None:
     learner, forgetful = make_learner(keeps_earlier=True), make_learner()
     untrained = learner.policy(0)
-    for one in (learner, forgetful):
-        iterate(one, tables[:8])
+    for each in (learner, forgetful):
+        iterate(each, tables[:8])
     assert learner.policy() is learner.policy(1) and learner.policy(0) is untrained
     assert weights(learner.policy()) == weights(forgetful.policy())
     restored = make_learner(keeps_earlier=True)

@@ -127,9 +127,9 @@ def test_the_predicted_change_is_that_of_the_model_rollout_with_noise_too() -> N
 def test_what_actions_from_elsewhere_are_promised_is_the_model_rollout_too() -> None:
     case = problem()
     actions = np.random.default_rng(1).normal(0, 0.2, (B, T, NU))
-    found = predicted_change(case.models.F, case.index, case.residual, case.root, actions)
+    promised = predicted_change(case.models.F, case.index, case.residual, case.root, actions)
     for b in range(B):
-        assert found[b].sum() == pytest.approx(case.objective(b, actions[b])[0], rel=1e-4)
+        assert promised[b].sum() == pytest.approx(case.objective(b, actions[b])[0], rel=1e-4)
 
 
 def test_a_heavy_kl_term_returns_the_policy_mean() -> None:
@@ -143,11 +143,11 @@ def test_sub_trajectories_do_not_influence_each_other() -> None:
     case = problem()
     together = case.solve()
     for b in range(B):
-        one = slice(b, b + 1)
+        only = slice(b, b + 1)
         alone = backward_pass(
-            prepare(case.models, C), case.index[one], case.residual[one], case.root, case.deviation[one]
+            prepare(case.models, C), case.index[only], case.residual[only], case.root, case.deviation[only]
         )
-        np.testing.assert_allclose(alone.k, together.k[one], rtol=1e-5)
+        np.testing.assert_allclose(alone.k, together.k[only], rtol=1e-5)
 
 
 def test_a_given_variance_replaces_the_fitted_one_and_has_a_floor() -> None:
@@ -174,13 +174,13 @@ def test_a_plain_loop_in_double_precision_gives_the_same_to_four_digits(
     target /= np.linalg.norm(target, axis=2, keepdims=True)
     residual = cost.residual(rng.normal(0, 0.5, (b, length, nx)), target, 0.8, 0.1)
     root, deviation = cost.root(nx, 0.1), rng.normal(0, np.sqrt(variance), (b, length, nu))
-    found = backward_pass(prepare(models, 0.02, variance), model, residual, root, deviation)
-    for one in range(b):
-        given = residual[one] @ root, root.T @ root, deviation[one]
-        K, k, change = plain_backward_pass(F[model[one]], P[model[one]], variance, 0.02, *given)
-        assert np.abs(found.K[one] - K).max() < 1e-4 * np.abs(K).max()
-        assert np.abs(found.k[one] - k).max() < 1e-4 * np.abs(k).max()
-        assert found.predicted_cost_change[one].sum() == pytest.approx(change, rel=1e-3)
+    improved = backward_pass(prepare(models, 0.02, variance), model, residual, root, deviation)
+    for place in range(b):
+        around = residual[place] @ root, root.T @ root, deviation[place]
+        K, k, change = plain_backward_pass(F[model[place]], P[model[place]], variance, 0.02, *around)
+        assert np.abs(improved.K[place] - K).max() < 1e-4 * np.abs(K).max()
+        assert np.abs(improved.k[place] - k).max() < 1e-4 * np.abs(k).max()
+        assert improved.predicted_cost_change[place].sum() == pytest.approx(change, rel=1e-3)
 
 
 def test_models_that_are_not_finite_are_refused() -> None:

@@ -63,13 +63,13 @@ def test_an_agreeing_prior_recovers_the_system_from_fewer_samples_than_regressor
 
 
 def test_the_prior_moves_slopes_from_the_samples_own_to_the_pooled_ones() -> None:
-    pool, own = moments(plant(3000, system(1), np.random.default_rng(2))), system(1) + 0.2
-    samples = plant(300, own, np.random.default_rng(3))
+    pool, planted = moments(plant(3000, system(1), np.random.default_rng(2))), system(1) + 0.2
+    samples = plant(300, planted, np.random.default_rng(3))
     distances = []
     for weight in (0.0, 30.0, 300.0, 3000.0, 1e6):
         options = FitOptions(modes=1, residual_threshold=10.0, prior_samples=weight, ridge=1e-9)
-        distances.append(np.linalg.norm(fit(samples, options, pool)[0].F[0] - own))
-    assert distances[0] < 1e-3 and distances[-1] == pytest.approx(np.linalg.norm(system(1) - own), rel=0.01)
+        distances.append(np.linalg.norm(fit(samples, options, pool)[0].F[0] - planted))
+    assert distances[0] < 1e-3 and distances[-1] == pytest.approx(np.linalg.norm(system(1) - planted), rel=0.01)
     assert distances == sorted(distances)
 
 

@@ -25,8 +25,8 @@ def test_every_transition_lies_in_exactly_one_bin(rows: Rows, alternative: Local
 
 def test_bins_by_kind_hold_one_kind_and_one_exit(rows: Rows) -> None:
     plans = localization.plans(rows, Localization.KIND, OPTIONS, 0, 0)
-    found = [(set(rows.kind[plan.rows].tolist()), set(rows.exit[plan.rows].tolist())) for plan in plans.values()]
-    assert all(len(kinds) == len(exits) == 1 for kinds, exits in found)
+    bins = [(set(rows.kind[plan.rows].tolist()), set(rows.exit[plan.rows].tolist())) for plan in plans.values()]
+    assert all(len(kinds) == len(exits) == 1 for kinds, exits in bins)
     assert len(localization.plans(rows, Localization.NONE, OPTIONS, 0, 0)) == 1
 
 
@@ -34,8 +34,8 @@ def test_k_means_finds_planted_groups() -> None:
     rng = np.random.default_rng(0)
     centres = np.array([[0.0, 0.0, 0.0], [5.0, 0.0, 0.0], [0.0, 5.0, 5.0]])
     planted = rng.integers(3, size=300)
-    found = localization.k_means(centres[planted] + 0.3 * rng.standard_normal((300, 3)), 3, rng)
-    assert len({(p, f) for p, f in zip(planted.tolist(), found.tolist(), strict=True)}) == 3
+    clusters = localization.k_means(centres[planted] + 0.3 * rng.standard_normal((300, 3)), 3, rng)
+    assert len({(p, f) for p, f in zip(planted.tolist(), clusters.tolist(), strict=True)}) == 3
 
 
 def test_clusters_are_a_function_of_states_and_generator(rows: Rows) -> None:
