@@ -11,7 +11,7 @@ import multiprocessing
 import os
 import tempfile
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from concurrent.futures import ProcessPoolExecutor
 from contextlib import closing
 from functools import partial
@@ -22,6 +22,7 @@ import numpy as np
 import pyarrow as pa
 
 from t6gps.service import config as configuration
+from t6gps.service.bench.rounds import Say
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.state import RunState
 from t6gps.service.ray_backend import processes
@@ -32,7 +33,7 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 FACTORS = (1, 4, 16)
 ITERATIONS_N = 2
 """The second one is measured: the action value leads in it."""
-ROLES = {"learner": "ray::LearnerActor", "fits": "ray::fit_class"}
+ROLES = {"learner": ("ray::LearnerActor",), "fits": ("ray::fit_class", "ray::IDLE")}
 """How the command lines of the processes begin, whose memory is reported beside the supervisor's."""
 NOTE = (
     "iteration_Nx_*: a whole iteration of N times the recorded episodes, replayed by the workers; peak_mb is the "
@@ -75,9 +76,7 @@ def _with(table: pa.Table, numbers: dict[str, int]) -> pa.Table:
     return table
 
 
-def growth(
-    episodes: Sequence[Episode], say: Callable[[str], None], factors: Sequence[int] = FACTORS
-) -> dict[str, float]:
+def growth(episodes: Sequence[Episode], say: Say, factors: Sequence[int] = FACTORS) -> dict[str, float]:
     """Seconds and peak memory of an iteration with as many copies of recorded episodes as each factor says.
 
     iteration_4x_steps         control steps of an iteration with four copies
@@ -95,9 +94,10 @@ def growth(
             durable.publish(path)
         for factor in factors:
             with ProcessPoolExecutor(1, mp_context=fresh) as process:
-                found = process.submit(_iterate, folder, factor * len(episodes)).result()
-            figures |= {f"iteration_{factor}x_{key}": value for key, value in found.items()}
-            say(f"{factor} times the data: {found}")
+                measured = process.submit(_iterate, folder, factor * len(episodes)).result()
+            figures |= {f"iteration_{factor}x_{key}": value for key, value in measured.items()}
+            words = ", ".join(f"{role} {measured[f'{role}_peak_mb']:.0f} MB" for role in ("supervisor", "learner"))
+            say(f"{factor} times the data: {words}")
     return figures
 
 
@@ -140,7 +140,7 @@ def _iterate(folder: Path, episodes_n: int) -> dict[str, float]:
     }
 
 
-def _peak_mb(begin: str) -> float:
+def _peak_mb(begin: tuple[str, ...]) -> float:
     """The largest peak of the processes below this one whose command lines begin so; 0 when there is none."""
     below = processes.descendants(os.getpid())
     return max((processes.peak_mb(pid) for pid in below if processes.command(pid).startswith(begin)), default=0.0)

@@ -14,7 +14,6 @@ from t6gps.service.provenance import Provenance, provenance
 from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
-    "growth": "t6gps.service.bench.learner",
     "learner": "t6gps.service.bench.learner",
     "physics": "t6gps.workers.bench.physics",
     "pool": "t6gps.service.bench.pool",
@@ -24,7 +23,9 @@ BENCHMARKS = {
 
 
 SIZED = ("pool",)
-"""Benchmarks that can be told how long and how often to measure, and that say how far they are."""
+"""Benchmarks that can be told how long and how often to measure."""
+LONG = ("learner", "pool")
+"""Benchmarks that say how far they are."""
 
 
 @dataclass(frozen=True)
@@ -56,7 +57,7 @@ def measure(name: str, say: Say, **sizes: float) -> Measurement:
         raise ConfigError(f"bench {name} has no --{' and no --'.join(sizes)}; allowed for: {', '.join(SIZED)}")
     module = importlib.import_module(BENCHMARKS[name])
     run: Callable[..., dict[str, float | None]] = getattr(module, name)
-    if name in SIZED:
+    if name in LONG:
         run = partial(run, say)
     threads, notes = getattr(module, "THREADS", 1), tuple(getattr(module, "NOTES", ()))
     return Measurement(name, provenance(), threads, notes, run(**sizes))
