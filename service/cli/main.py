@@ -7,7 +7,6 @@ commands that need it, so that the others answer at once.
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from contextlib import closing
@@ -149,7 +148,7 @@ def evaluate(
     ):
         result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
     if as_json:
-        typer.echo(json.dumps(result))
+        typer.echo(result.to_json())
     else:
         terminal.print_evaluation(result)
 
