@@ -71,7 +71,7 @@ def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: P
     path = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
     arguments = ["--root", str(tmp_path / "runs"), "--serial", "--set=run.episodes=2", "--set=run.iterations=1"]
     done = subprocess.run(
-        [sys.executable, "-S", "-m", "t6gps.service.cli.main", "train", "flat-quick", *arguments, "--set=run.steps=20"],
+        [sys.executable, "-S", "-m", "t6gps", "train", "flat-quick", *arguments, "--set=run.steps=20"],
         env={**os.environ, "PYTHONPATH": path},
         cwd=tmp_path,
         capture_output=True,
