@@ -17,9 +17,9 @@ with caller.untouched():  # its import sets a variable
 
 def limit() -> Callable[[], None]:
     """Let the libraries that are loaded compute with one thread from now on; the function that puts it back."""
-    limits = threadpool_limits(1)
     torch = sys.modules.get("torch")  # it keeps a number of its own, which threadpoolctl does not know
     threads_n = 1 if torch is None else torch.get_num_threads()
+    limits = threadpool_limits(1)
     if torch is not None:
         torch.set_num_threads(1)
 
