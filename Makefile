@@ -28,13 +28,14 @@ test: install
 # The tree as `t6gps/...`, in links, for tools that do not know how the rooms are mapped into the package.
 view:
 	@mkdir -p build/typing/t6gps && for room in $(ROOMS) deploy; do ln -sfn ../../../$$room build/typing/t6gps/$$room; done
+	@for file in __init__.py __main__.py py.typed; do ln -sfn ../../../deploy/t6gps/$$file build/typing/t6gps/$$file; done
 
 check: install view
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
-	$(BIN)/lint-imports
+	cd build/typing && PYTHONPATH=. ../../$(BIN)/lint-imports --config ../../pyproject.toml
 	cd build/typing && MYPYPATH=. ../../$(BIN)/mypy --config-file ../../pyproject.toml --namespace-packages \
-		--explicit-package-bases $(ROOMS:%=t6gps/%)
+		--explicit-package-bases t6gps/__init__.py t6gps/__main__.py $(ROOMS:%=t6gps/%)
 
 bench: install
 	$(BIN)/t6gps bench physics

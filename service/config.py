@@ -136,6 +136,16 @@ def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") 
     return _with_whole_paths(config) if overrides else config
 
 
+def check_keys(overrides: Sequence[str], command: str, allowed: tuple[str, ...], reason: str) -> None:
+    """ConfigError for an override whose key starts with nothing that is allowed."""
+    for override in overrides:
+        if not override.startswith(allowed):
+            raise ConfigError(
+                f"{command} cannot change {override.partition('=')[0]}: {reason}; "
+                f"allowed: keys that start with {', '.join(allowed)}"
+            )
+
+
 def differences(stored: Config, wanted: Config) -> list[str]:
     """Keys whose values differ, with both values; those of SPEED_ONLY may differ."""
     a, b = _flat(stored.model_dump()), _flat(wanted.model_dump())

@@ -96,6 +96,11 @@ def load_latest(folder: Path) -> tuple[int, dict[str, JSON], Arrays] | None:
     return None
 
 
+def kept(folder: Path) -> dict[int, Path]:
+    """The folders of the checkpoints under `folder`, by iteration."""
+    return {int(path.name.removeprefix("iteration-")): path for path in _found(folder)}
+
+
 def _found(folder: Path) -> list[Path]:
     """The folders of all checkpoints, the newest first."""
     return sorted(folder.glob("iteration-*"), reverse=True)

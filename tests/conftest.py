@@ -2,9 +2,6 @@
 
 from __future__ import annotations
 
-import t6gps.service  # noqa: F401 - first: it sets what must be set before numpy and ray are loaded
-
-# isort: split
 import time
 from collections.abc import Callable
 from typing import Any
@@ -13,8 +10,13 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
+from t6gps.__main__ import use_one_thread
+from t6gps.service import threads
 from t6gps.storage import schema
 from t6gps.storage.records import Episode
+
+threads.limit()  # of the libraries that are loaded
+use_one_thread()  # of those to come, and in other processes
 
 
 def _column(field: pa.Field, rows: int, rng: np.random.Generator) -> pa.Array:

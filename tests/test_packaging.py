@@ -31,19 +31,33 @@ def wheel(tmp_path_factory: pytest.TempPathFactory) -> Path:
     return next(folder.glob("*.whl"))
 
 
+def folder_of(package: str) -> Path:
+    """Where a package lies in the repository."""
+    mapped = SETUPTOOLS["package-dir"]
+    if package in mapped:
+        return REPOSITORY / mapped[package]
+    parent, _, name = package.rpartition(".")
+    return folder_of(parent) / name
+
+
 def test_every_folder_with_modules_is_listed_as_a_package() -> None:
     rooms = SETUPTOOLS["package-dir"].values()
-    folders = {path.parent.relative_to(REPOSITORY) for room in rooms for path in (REPOSITORY / room).rglob("*.py")}
-    assert {"t6gps." + ".".join(folder.parts) for folder in folders} == set(SETUPTOOLS["packages"])
-    assert SETUPTOOLS["package-dir"] == {f"t6gps.{room}": room for room in rooms}
+    folders = {path.parent for room in rooms for path in (REPOSITORY / room).rglob("*.py")}
+    assert {folder_of(package) for package in SETUPTOOLS["packages"]} == folders
+
+
+def test_the_package_has_a_room_for_each_folder_and_its_own_modules_lie_in_deploy() -> None:
+    mapped = dict(SETUPTOOLS["package-dir"])
+    assert mapped.pop("t6gps") == "deploy/t6gps"
+    assert mapped == {f"t6gps.{room}": room for room in mapped.values()}
 
 
 @pytest.mark.slow
 def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
-    for room in SETUPTOOLS["package-dir"].values():
-        for module in (REPOSITORY / room).rglob("*.py"):
-            assert f"t6gps/{module.relative_to(REPOSITORY)}" in names
+    for package in SETUPTOOLS["packages"]:
+        for module in folder_of(package).glob("*.py"):
+            assert f"{package.replace('.', '/')}/{module.name}" in names
     for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
         assert f"t6gps/deploy/presets/{preset.name}" in names
     for module in SETUPTOOLS["ext-modules"]:
@@ -54,6 +68,7 @@ def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None
 @pytest.mark.slow
 def test_the_wheel_is_typed_compiled_modules_included(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
+    assert "t6gps/py.typed" in names
     for room in ("storage", "workers", "learner", "service"):
         assert f"t6gps/{room}/py.typed" in names
         for stub in (REPOSITORY / room).rglob("*.pyi"):
@@ -71,7 +86,7 @@ def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: P
     path = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
     arguments = ["--root", str(tmp_path / "runs"), "--serial", "--set=run.episodes=2", "--set=run.iterations=1"]
     done = subprocess.run(
-        [sys.executable, "-S", "-m", "t6gps.service.cli.main", "train", "flat-quick", *arguments, "--set=run.steps=20"],
+        [sys.executable, "-S", "-m", "t6gps", "train", "flat-quick", *arguments, "--set=run.steps=20"],
         env={**os.environ, "PYTHONPATH": path},
         cwd=tmp_path,
         capture_output=True,

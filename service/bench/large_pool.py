@@ -31,7 +31,7 @@ from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.state import Identity, PoolState, RunState, WorkerId
-from t6gps.service.ray_backend.cluster import join_or_start, this_node
+from t6gps.service.ray_backend.cluster import connection, this_node
 from t6gps.service.ray_backend.transport import Call, RayTransport, Remote
 from t6gps.service.ray_backend.worker_actor import Answer, Started
 from t6gps.storage import ipc
@@ -138,11 +138,8 @@ def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, fl
     most_episodes_per_s                      where the main thread has no time left: the sum of the above but for the
                                              background is a second
     """
-    join_or_start(job.config)
-    try:
+    with connection(job.config):
         return {f"pool_{n}_{key}": value for n in sizes for key, value in _measured(job, n, seconds).items()}
-    finally:
-        ray.shutdown()
 
 
 def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:

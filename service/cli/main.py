@@ -7,7 +7,6 @@ commands that need it, so that the others answer at once.
 
 from __future__ import annotations
 
-import json
 import shlex
 import sys
 from contextlib import closing
@@ -28,7 +27,6 @@ from t6gps.service.cli.options import (
     RunName,
     Serial,
     Workers,
-    check_keys,
     with_workers,
 )
 from t6gps.service.studies import declared
@@ -43,11 +41,10 @@ from t6gps.storage.errors import T6GpsError
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
-EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
 
 
 def main() -> None:
-    """Entry point of the command."""
+    """Run the command; `t6gps.__main__` has prepared the process."""
     try:
         app()
     except T6GpsError as error:
@@ -75,12 +72,7 @@ def train(
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
-    name = Path(source).stem if run_name is None else run_name
-    if resume:
-        run = catalog.open_run(root, name)
-        session.check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
-    else:
-        run = catalog.create(root, _free_name(root, name) if run_name is None else name, config.to_json())
+    run = session.begin(config, root, run_name, Path(source).stem, resume)
     try:
         with terminal.ProgressDisplay(config.run.iterations) as display:
             result = session.complete(config, run, serial, display)
@@ -141,15 +133,14 @@ def evaluate(
 ) -> None:
     """Evaluate a run's newest policy without noise on unseen seeds."""
     run = catalog.open_run(root, run_name)
-    check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
-    config = configuration.parse(run.config_path.read_text(), with_workers(overrides, workers))
+    config = session.evaluation_config(run, with_workers(overrides, workers))
     with (
         closing(session.restored(config, run, serial, engine)) as executor,
         terminal.ProgressDisplay(config.run.iterations) as display,
     ):
         result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
     if as_json:
-        typer.echo(json.dumps(result))
+        typer.echo(result.to_json())
     else:
         terminal.print_evaluation(result)
 
@@ -179,16 +170,6 @@ stored.add_to(app)
 live.add_to(app)
 
 
-def _free_name(root: Path, name: str) -> str:
-    """`name`, or the first of name-2, name-3, ... that no run has."""
-    taken = {run.name for run in catalog.list_runs(root)}
-    number = 2
-    free = name
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
-
-
 def _exit_interrupted(command: list[str]) -> NoReturn:
     """Say how to continue what Ctrl-C or SIGTERM has stopped, and exit."""
     terminal.say(f"stopped; everything sampled so far is kept. Resume with: {shlex.join(command)}")
@@ -209,7 +190,3 @@ def _study_command(
     parts += [] if root == DEFAULT_ROOT else ["--root", str(root)]
     parts += [] if out is None else ["--out", str(out)]
     return parts + [f"--set={override}" for override in overrides or []]
-
-
-if __name__ == "__main__":
-    main()

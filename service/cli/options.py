@@ -24,16 +24,6 @@ Autoscale = Annotated[
 ]
 
 
-def check_keys(overrides: list[str] | None, command: str, allowed: tuple[str, ...], reason: str) -> None:
-    """ConfigError for an override whose key starts with nothing that is allowed."""
-    for override in overrides or []:
-        if not override.startswith(allowed):
-            raise ConfigError(
-                f"{command} cannot change {override.partition('=')[0]}: {reason}; "
-                f"allowed: keys that start with {', '.join(allowed)}"
-            )
-
-
 def with_workers(overrides: list[str] | None, workers: int | None, autoscale: str | None = None) -> list[str]:
     """The overrides, and those that --workers and --autoscale stand for. ConfigError unless it is MIN:MAX."""
     settings = [] if workers is None else [f"run.workers={workers}"]

@@ -12,7 +12,7 @@ import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
-from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, check_keys
+from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName
 from t6gps.service.training import evaluation
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
@@ -129,7 +129,9 @@ def export(
     from t6gps.workers.ground.ground import ground
     from t6gps.workers.physics.mjcf import to_mjcf
 
-    check_keys(overrides, f"export {form.value}", EXPORT_SECTIONS, "the model has only a robot and its ground")
+    configuration.check_keys(
+        overrides or [], f"export {form.value}", EXPORT_SECTIONS, "the model has only a robot and its ground"
+    )
     config = configuration.parse("{}", overrides or [], "--set")
     text = to_mjcf(config.robot, ground(config.terrain, terrain_seed, config.terrain.difficulty))
     try:

@@ -5,9 +5,9 @@ Ray restarts nothing: the supervisor replaces workers and the policy server, the
 
 from __future__ import annotations
 
-import signal
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +15,7 @@ import ray
 
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import Progress
+from t6gps.service import caller
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.ray_learner import RayLearner
@@ -36,8 +37,8 @@ from t6gps.workers.worker import RolloutWorker
 class RayExecutor(Executor):
     """Workers, learner and policy server as actors on Ray.
 
-    Joins the cluster that RAY_ADDRESS names; without it, starts an embedded one on the loopback address with
-    a token of its own (`t6gps.service`).
+    They use the Ray that this process is connected to, or join the cluster that RAY_ADDRESS names. Without either, they
+    start an embedded one on the loopback address with a token of its own (`cluster.connection`).
     """
 
     def __init__(
@@ -48,8 +49,9 @@ class RayExecutor(Executor):
         timings: Timings = TIMINGS,
     ) -> None:
         super().__init__(config, run)
-        most = cluster.join_or_start(config)
-        self.transport = RayTransport(make_worker, config.rollout, config.run.cpus_per_worker, timings)
+        self._learner: RayLearner | None = None
+        self._keep_ahead: Keep | None = None
+        self._closed = False
         state = PoolState(
             config.run.workers,
             settings_digest(config.rollout.model_dump_json()),
@@ -58,11 +60,14 @@ class RayExecutor(Executor):
             EpisodeTimes(timings.shortest_episode_s),
             config.run.autoscale,
         )
-        log = None if run is None else DecisionLog(run.pool)
-        self.pool = Pool(state, self.transport, Control(run, most), self._quarantine, log)
-        self._learner: RayLearner | None = None
-        self._keep_ahead: Keep | None = None
-        self.tend()
+        with ExitStack() as started:
+            most = started.enter_context(cluster.connection(config))
+            self.transport = RayTransport(make_worker, config.rollout, config.run.cpus_per_worker, timings)
+            started.callback(self.transport.close)
+            log = None if run is None else DecisionLog(run.pool)
+            self.pool = Pool(state, self.transport, Control(run, most), self._quarantine, log)
+            self.tend()
+            self._held = started.pop_all()
 
     @property
     def learner(self) -> RayLearner:
@@ -107,16 +112,13 @@ class RayExecutor(Executor):
         self._learner = None
 
     def close(self, outcome: RunState = RunState.STOPPING) -> None:
-        if not ray.is_initialized():
+        if self._closed:
             return
-        # A second Ctrl-C must not leave half of the processes behind.
-        previous = {number: signal.signal(number, signal.SIG_IGN) for number in (signal.SIGINT, signal.SIGTERM)}
-        try:
-            self.pool.close(outcome, "" if outcome is RunState.DONE else "the run was stopped")
-        finally:
-            ray.shutdown()
-            for number, handler in previous.items():
-                signal.signal(number, handler)
+        self._closed = True
+        with caller.undisturbed(), self._held:
+            if ray.is_initialized():  # its caller may have ended it
+                self.pool.close(outcome, "" if outcome is RunState.DONE else "the run was stopped")
+                self.replace_learner()
 
     def _until_done(self, reference: Any) -> None:
         """Wait for the learner, and tend the pool meanwhile."""

@@ -10,14 +10,16 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from functools import cache
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import ray
 
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.rows import AnyArray
+from t6gps.service import threads
 from t6gps.service.config import Config
 from t6gps.service.pool import control
 from t6gps.service.ray_backend.cluster import start_actor
@@ -27,6 +29,8 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
 from t6gps.storage.records import PolicySnapshot
 
+Job = TypeVar("Job")
+Result = TypeVar("Result")
 EPISODES_UNDER_WAY_N = 32
 """Episodes on their way to the learner. When it takes no more, sampling waits: the object store is bounded."""
 
@@ -37,6 +41,7 @@ class LearnerActor:
     def __init__(self, config: Config) -> None:
         from t6gps.service.execution.wiring import new_learner  # it loads torch, which the supervisor does without
 
+        threads.limit()
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
 
     def add(self, answer: Answer) -> None:
@@ -163,6 +168,20 @@ def _get(reference: Any) -> Any:
         ) from error
 
 
+def _with_one_thread(function: Callable[[Job], Result]) -> Callable[[Job], Result]:
+    def limited(job: Job) -> Result:
+        _limit_once()
+        return function(job)
+
+    return limited
+
+
+@cache
+def _limit_once() -> None:
+    """Set what holds as long as the process lives, and takes some milliseconds to set."""
+    threads.limit()
+
+
 def _task_map(width: int) -> Callable[..., Iterator[Any]]:
     """A `map` that runs up to `width` calls at once as Ray tasks and yields their results in order.
 
@@ -171,7 +190,7 @@ def _task_map(width: int) -> Callable[..., Iterator[Any]]:
     """
 
     def task_map(function: Callable[[Any], Any], jobs: Iterable[Any]) -> Iterator[Any]:
-        task = ray.remote(num_cpus=0, max_retries=3)(function)
+        task = ray.remote(num_cpus=0, max_retries=3)(_with_one_thread(function))
         pending: deque[Any] = deque()
         for job in jobs:
             pending.append(task.remote(job))

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 from t6gps.learner.learner import Learner
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import Progress
+from t6gps.service import threads
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.wiring import new_learner
@@ -24,7 +26,10 @@ from t6gps.workers.worker import RolloutWorker
 
 
 class SerialExecutor(Executor):
-    """One worker and the learner, which take turns."""
+    """One worker and the learner, which take turns.
+
+    Libraries compute with one thread in this process until `close`, so that data do not depend on the caller.
+    """
 
     def __init__(
         self,
@@ -33,8 +38,12 @@ class SerialExecutor(Executor):
         simulation: Callable[[RobotSettings], Engine] = PyBulletEngine,
     ) -> None:
         super().__init__(config, run)
-        self._worker = RolloutWorker(config.rollout, simulation)
-        self.replace_learner()
+        with ExitStack() as started:
+            started.callback(threads.limit())
+            self._worker = RolloutWorker(config.rollout, simulation)
+            started.callback(self._worker.close)
+            self.replace_learner()
+            self._held = started.pop_all()
 
     @property
     def learner(self) -> Learner:
@@ -77,4 +86,4 @@ class SerialExecutor(Executor):
         self._learner = new_learner(self.config)
 
     def close(self, outcome: RunState = RunState.STOPPING) -> None:
-        self._worker.close()
+        self._held.close()

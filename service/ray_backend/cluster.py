@@ -9,12 +9,16 @@ from __future__ import annotations
 import logging
 import math
 import os
+import secrets
 import socket
+from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import Any
 
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
+from t6gps.service import caller
 from t6gps.service.config import WORKERS_MOST_N, Config
 from t6gps.service.ray_backend import private
 from t6gps.storage.errors import RunError
@@ -25,15 +29,52 @@ CONNECT_DEADLINE_S = 10.0
 SPREAD = "SPREAD"
 
 
-def join_or_start(config: Config) -> int:
-    """Join the cluster of RAY_ADDRESS or start an embedded one; the largest number of workers that may be wished.
+def embedded_environment() -> dict[str, str]:
+    """Variables for the processes of an embedded Ray, which reads its settings from them.
 
-    RunError when that fails.
+    It talks only to processes that know its token. Whoever has set one of them keeps it.
     """
-    private.prepare_start()
+    return {
+        "RAY_AUTH_MODE": "token",
+        "RAY_AUTH_TOKEN": secrets.token_hex(32),
+        # Ray would run the workers at the lowest priority but four: on a busy machine they hardly start.
+        "RAY_worker_niceness": "0",
+        "RAY_task_events_report_interval_ms": "0",  # nobody asks for the history of calls
+        "RAY_memory_monitor_refresh_ms": "1000",  # four times a second costs a thousandth of a core
+        # Processes that fit models wait for the next iteration. Ray would end them after a second, and a new one takes
+        # longer to start than the fits take.
+        "RAY_idle_worker_killing_time_threshold_ms": "300000",
+    } | {name: value for name, value in os.environ.items() if name.startswith("RAY_")}
+
+
+@contextmanager
+def connection(config: Config) -> Iterator[int]:
+    """Ray for the time of a run; the largest number of workers that may be asked for.
+
+    The Ray that this process is connected to is used, and left running at the end. Else the cluster of RAY_ADDRESS is
+    joined; without that, an embedded Ray is started. Its settings and its token reach its processes through environment
+    variables (`embedded_environment`), which are set while it starts and put back before this function yields.
+    RunError when it cannot be joined or started.
+    """
+    if ray.is_initialized():
+        yield WORKERS_MOST_N
+        return
+    with private.adapted():
+        try:
+            with caller.untouched():
+                most = _join_or_start(config)
+            yield most
+        finally:
+            with caller.untouched():
+                ray.shutdown()
+            private.read_authentication()
+
+
+def _join_or_start(config: Config) -> int:
     if "RAY_ADDRESS" in os.environ:
         _join(os.environ["RAY_ADDRESS"])
         return WORKERS_MOST_N  # nodes may join later
+    os.environ.update(embedded_environment())
     each = config.run.cpus_per_worker
     workers_n = max(config.run.workers, *(config.run.autoscale or (0,)))
     cpus_n = max(math.ceil(workers_n * each), os.cpu_count() or 1)
@@ -90,8 +131,8 @@ def _join(address: str) -> None:
 
 def _init(trouble: str, remedy: str, **options: Any) -> None:
     """Start or join Ray. RunError when that fails."""
+    private.read_authentication()
     try:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
     except Exception as error:  # Ray has no narrower one for this
-        ray.shutdown()
         raise RunError(f"{trouble}: {' '.join(str(error).split())}; {remedy}") from error

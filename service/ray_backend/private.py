@@ -1,32 +1,46 @@
 """Everything that is used of Ray beyond its public names.
 
 What Ray does not offer otherwise: which nodes have room, whether an actor has found one, where logs are, an embedded
-Ray that listens on the loopback address alone, and a standard output without its messages. The tests of tests/faults
-run through each name; whoever takes another version of Ray begins with this page.
+Ray that listens on the loopback address alone, its token, and a standard output without its messages. The tests of
+tests/faults run through each name; whoever takes another version of Ray begins with this page.
 """
 
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
 from ray._private import services
 from ray._private import worker as ray_worker
 from ray._private.state import actors, available_resources_per_node
+from ray._raylet import AuthenticationTokenLoader, Config  # type: ignore[attr-defined]
 
 _WAITING = ("DEPENDENCIES_UNREADY", "PENDING_CREATION")
 _log = logging.getLogger(__name__)
 
 
-def prepare_start() -> None:
-    """Before `ray.init`: use addresses as they are given, and print nothing.
+@contextmanager
+def adapted() -> Iterator[None]:
+    """Let Ray use addresses as they are given, and print nothing, until the end.
 
     Ray would replace a loopback address by that of the host: ports open to its network, a cluster that is not found.
     Its messages, such as the death of a worker that the pool replaces, would stand among the results.
     """
-    services.resolve_ip_for_localhost = _as_given
-    ray_worker.print_to_stdstream = _to_log
+    kept = services.resolve_ip_for_localhost, ray_worker.print_to_stdstream
+    services.resolve_ip_for_localhost, ray_worker.print_to_stdstream = _as_given, _to_log
+    try:
+        yield
+    finally:
+        services.resolve_ip_for_localhost, ray_worker.print_to_stdstream = kept
+
+
+def read_authentication() -> None:
+    """Let Ray read mode and token from the environment again: it does so once, and somebody may have used it before."""
+    Config.initialize("")
+    AuthenticationTokenLoader.instance().reset_cache()
 
 
 def logs_folder() -> Path:

@@ -171,6 +171,13 @@ class RayTransport(Transport):
         elif remote.node in self._agents:
             self._agents[remote.node].kill.remote(remote.process)
 
+    def close(self) -> None:
+        """End what looks after the workers: the policy server, and the agents of other nodes."""
+        if not ray.is_initialized():
+            return
+        for actor in (self.policies.source.actor, *self._agents.values()):
+            ray.kill(actor)
+
     def placed(self, worker: WorkerId) -> bool:
         return private.is_placed(self._remotes[worker].actor)
 

@@ -10,6 +10,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import ray
 
+from t6gps.service import threads
 from t6gps.service.pool.attempt import Failure, Runner, attempt, policy_digest, settings_digest
 from t6gps.service.pool.state import Identity
 from t6gps.service.ray_backend import cluster, processes
@@ -59,6 +60,7 @@ class WorkerActor:
     def open(self, make_worker: MakeWorker, settings: RolloutSettings) -> Started:
         """Make the worker."""
         self._worker = make_worker(settings)
+        threads.limit()
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
         digest = settings_digest(settings.model_dump_json())
         return Started(Identity(os.getpid(), address, cluster.this_node(), digest), self._process)

@@ -51,7 +51,7 @@ def evaluations(finished: Sequence[Finished]) -> Figure:
             for column, (key, (title, factor)) in enumerate(QUANTITIES.items()):
                 axes = row[column]
                 for place, (runs, colour) in enumerate(zip(labels.values(), cycle(COLOURS), strict=False)):
-                    means = [outcome.evaluation[key]["mean"] for outcome in runs]
+                    means = [outcome.evaluation.estimates()[key].mean for outcome in runs]
                     values = factor * np.array([mean for mean in means if mean is not None])
                     if len(values):
                         _dots(axes, place, values, colour)
@@ -168,7 +168,7 @@ def conditions(finished: Sequence[Finished]) -> Figure:
                 axes.plot([], [], color=colour, marker="o", linestyle="", label=label)
                 for place, name in enumerate([None, *names]):
                     worlds = [outcome.evaluation if name is None else outcome.conditions[name] for outcome in runs]
-                    means = np.array([evaluation[key]["mean"] for evaluation in worlds])
+                    means = np.array([evaluation.estimates()[key].mean for evaluation in worlds], dtype=float)
                     _dots(axes, place + lift, factor * means, colour)
             axes.set_yticks(range(len(names) + 1), ["as trained", *names])
             axes.set_ylim(len(names) + 0.6, -0.6)

@@ -64,7 +64,7 @@ def run_rows(finished: Sequence[Finished]) -> list[Row]:
     rows = []
     for outcome in finished:
         iterations = tables.read(outcome.run, "iterations").sort_by("iteration").to_pylist()
-        evaluated = {key: outcome.evaluation.get(key, {}).get("mean") for key in EVALUATED}
+        evaluated = {name: estimate.mean for name, estimate in outcome.evaluation.estimates().items()}
         rows.append(
             {
                 "run": outcome.run.name,
@@ -113,7 +113,7 @@ def condition_rows(finished: Sequence[Finished]) -> list[Row]:
             "arm": outcome.trial.arm,
             "seed": outcome.trial.seed,
             "condition": condition,
-            **{key: result.get(key, {}).get("mean") for key in EVALUATED},
+            **{name: estimate.mean for name, estimate in result.estimates().items()},
         }
         for outcome in finished
         for condition, result in {"as trained": outcome.evaluation, **outcome.conditions}.items()

@@ -4,8 +4,8 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
 
 import pyarrow as pa
 
@@ -26,8 +26,48 @@ EVALUATED = {
 }
 """Reported quantities and the columns of `episodes` they summarise."""
 
-Evaluation = dict[str, Any]
-"""`episodes`, `seed`, and of each of EVALUATED its mean and standard error over the episodes that have it (or None)."""
+
+@dataclass(frozen=True)
+class Estimate:
+    """Mean and standard error over the episodes that have a quantity; both None where no episode has it."""
+
+    mean: float | None = None
+    standard_error: float | None = None
+
+
+@dataclass(frozen=True, kw_only=True)
+class Evaluation:
+    """What a policy does without noise, over a number of episodes whose starts and waypoints hang on `seed`.
+
+    forward_speed_m_per_s       speed towards the waypoint (m/s)
+    stuck_share                 share of seconds in which the robot is slower than 0.05 m/s
+    stuck_share_by_distance     share of seconds in which it comes no further
+    waypoints_per_episode       waypoints reached
+    cost                        mean running cost (m2/s2)
+    """
+
+    episodes: int
+    seed: int
+    forward_speed_m_per_s: Estimate = Estimate()
+    stuck_share: Estimate = Estimate()
+    stuck_share_by_distance: Estimate = Estimate()
+    waypoints_per_episode: Estimate = Estimate()
+    cost: Estimate = Estimate()
+
+    def estimates(self) -> dict[str, Estimate]:
+        """The quantities by name, in the order of EVALUATED."""
+        return {name: getattr(self, name) for name in EVALUATED}
+
+    def to_json(self, indent: int | None = None) -> str:
+        """The evaluation as the run keeps it."""
+        return json.dumps(asdict(self), indent=indent)
+
+    @classmethod
+    def from_json(cls, text: str) -> Evaluation:
+        """The evaluation that `to_json` wrote; an older run may lack a quantity."""
+        stored = json.loads(text)
+        estimates = {name: Estimate(**stored[name]) for name in EVALUATED if name in stored}
+        return cls(episodes=stored["episodes"], seed=stored["seed"], **estimates)
 
 
 def evaluate(
@@ -51,26 +91,25 @@ def evaluate(
 def summarise(summaries: Sequence[pa.Table], seed: int) -> Evaluation:
     """The evaluation that episodes (rows of `episodes`) make up."""
     table = pa.concat_tables(summaries)
-    result: Evaluation = {"episodes": len(summaries), "seed": seed}
-    for key, column in EVALUATED.items():
+    estimates = {}
+    for name, column in EVALUATED.items():
         values = table[column].drop_null().to_numpy().astype(float)
-        mean, error = mean_and_error(values) if len(values) else (None, None)
-        result[key] = {"mean": mean, "standard_error": error}
-    return result
+        estimates[name] = Estimate(*mean_and_error(values)) if len(values) else Estimate()
+    return Evaluation(episodes=len(summaries), seed=seed, **estimates)
 
 
 def keep(run: Run, evaluation: Evaluation, condition: str | None = None) -> None:
     """Keep the evaluation that ended the training, or one under another condition, beside the run's tables."""
     path = _path(run, condition)
     path.parent.mkdir(exist_ok=True)
-    durable.hidden(path).write_text(json.dumps(evaluation, indent=2) + "\n")
+    durable.hidden(path).write_text(evaluation.to_json(indent=2) + "\n")
     durable.publish(path)
 
 
 def kept(run: Run, condition: str | None = None) -> Evaluation | None:
     """The evaluation that ended the training, or one under another condition; None before it is kept."""
     path = _path(run, condition)
-    return json.loads(path.read_text()) if path.exists() else None
+    return Evaluation.from_json(path.read_text()) if path.exists() else None
 
 
 def _path(run: Run, condition: str | None) -> Path:

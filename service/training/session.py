@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-import signal
 from collections.abc import Callable, Sequence
 from contextlib import closing
 from enum import StrEnum
+from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from t6gps.learner.port import Manifest
+from t6gps.service import caller
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
@@ -23,6 +24,9 @@ from t6gps.storage.errors import PhysicsError, RunError, TerrainError
 if TYPE_CHECKING:
     from t6gps.workers.physics import engine as physics
     from t6gps.workers.settings import RobotSettings
+
+
+EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
 
 
 class Engine(StrEnum):
@@ -46,16 +50,11 @@ def start_executor(config: Config, serial: bool, run: Run | None = None, engine:
 
         executor = SerialExecutor(config, run, _simulation(engine))
     else:
-        from t6gps.service.execution.ray_executor import RayExecutor
+        with caller.untouched():  # the import of Ray sets a variable
+            from t6gps.service.execution.ray_executor import RayExecutor
 
         executor = RayExecutor(config, run)
-    _heed_sigterm()
     return executor
-
-
-def _heed_sigterm() -> None:
-    """Make SIGTERM stop the program as Ctrl-C does: Ray sets other handlers as it starts and stops."""
-    signal.signal(signal.SIGTERM, signal.default_int_handler)
 
 
 def _simulation(engine: Engine) -> Callable[[RobotSettings], physics.Engine]:
@@ -76,6 +75,28 @@ def check_unchanged(run: Run, config: Config, remedy: str) -> None:
         raise RunError(f"run {run.name} has another configuration: {'; '.join(changed)}; {remedy}")
 
 
+def begin(config: Config, root: Path, name: str | None, default: str, resume: bool) -> Run:
+    """The run of that name below `root`: a new one, or the one that there is, to `resume` it.
+
+    Without a name it is `default`, or the first of default-2, default-3, ... that no run has. RunError when the name is
+    taken or refused, when there is nothing to resume, or when it has another configuration.
+    """
+    if resume:
+        run = catalog.open_run(root, default if name is None else name)
+        check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
+        return run
+    return catalog.create(root, _free_name(root, default) if name is None else name, config.to_json())
+
+
+def _free_name(root: Path, name: str) -> str:
+    taken = {run.name for run in catalog.list_runs(root)}
+    number = 2
+    free = name
+    while free in taken:
+        free, number = f"{name}-{number}", number + 1
+    return free
+
+
 def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
     """Train what is missing of a run, evaluate its policy without noise, and keep the result.
 
@@ -92,7 +113,6 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
             size = config.run
             result = evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
             executor.close(RunState.DONE)
-        _heed_sigterm()
         evaluation.keep(run, result)
         return result
 
@@ -103,6 +123,12 @@ def evaluate_newest(run: Run, overrides: Sequence[str], serial: bool, observer: 
     with closing(restored(config, run, serial)) as executor:
         size = config.run
         return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
+
+
+def evaluation_config(run: Run, overrides: Sequence[str]) -> Config:
+    """A run's configuration in the world that `overrides` change. ConfigError for one that would change the policy."""
+    configuration.check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
+    return configuration.parse(run.config_path.read_text(), overrides)
 
 
 def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:

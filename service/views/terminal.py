@@ -7,6 +7,7 @@ import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
+from dataclasses import asdict
 from types import TracebackType
 from typing import Any
 
@@ -25,7 +26,7 @@ from rich.progress import (
 from rich.table import Table
 
 from t6gps.learner.phases import PHASES
-from t6gps.service.training.evaluation import EVALUATED, Evaluation
+from t6gps.service.training.evaluation import Evaluation
 
 console = Console(stderr=True)
 """Progress and messages go to stderr, results to stdout, so that results can be piped."""
@@ -167,9 +168,9 @@ def print_rows(title: str, rows: Sequence[Mapping[str, object]], columns: Mappin
 
 def print_evaluation(result: Evaluation) -> None:
     """Print what `evaluate` measured."""
-    title = f"Noise-free policy, {result['episodes']} unseen episodes (seed {result['seed']})"
+    title = f"Noise-free policy, {result.episodes} unseen episodes (seed {result.seed})"
     columns = {"key": ("quantity", "{}"), "mean": ("mean", "{:.4f}"), "standard_error": ("standard error", "{:.4f}")}
-    print_rows(title, [{"key": key, **result[key]} for key in EVALUATED if key in result], columns)
+    print_rows(title, [{"key": name, **asdict(estimate)} for name, estimate in result.estimates().items()], columns)
 
 
 def write_table(table: pa.Table, form: str) -> None:

@@ -19,7 +19,7 @@ from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.state import RunState, Worker
-from t6gps.service.ray_backend import cluster
+from t6gps.service.ray_backend import cluster, private
 from t6gps.storage import catalog, schema
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import stub
@@ -57,8 +57,9 @@ def add_node(nodes: Cluster) -> None:
 def three_nodes() -> Iterator[Cluster]:
     """A cluster of three nodes of one CPU on this machine, to which RAY_ADDRESS leads."""
     with pytest.MonkeyPatch.context() as environment:
-        for name, value in QUICK_HEALTH_CHECKS.items():
+        for name, value in (cluster.embedded_environment() | QUICK_HEALTH_CHECKS).items():
             environment.setenv(name, value)
+        private.read_authentication()
         found = Cluster()
         try:
             for _ in range(3):

@@ -156,7 +156,7 @@ def hosts(tmp_path_factory: pytest.TempPathFactory, wait_until: Callable[..., No
 def test_t19_who_has_no_token_or_a_wrong_address_is_told_so_in_one_error(
     hosts: Hosts, tmp_path: Path, environment: dict[str, str], words: str
 ) -> None:
-    command = ["-m", "t6gps.service.cli.main", "train", "flat-quick", "--root", str(tmp_path)]
+    command = ["-m", "t6gps", "train", "flat-quick", "--root", str(tmp_path)]
     refused = hosts.run(*command, **environment)
     assert refused.wait(120) == 2
     said = hosts.said(refused)

@@ -6,9 +6,6 @@ speed of each contender over that loop's of the same round, medians over rounds.
 
 from __future__ import annotations
 
-import t6gps.service  # noqa: F401 - first: it sets what must be set before numpy and ray are loaded
-
-# isort: split
 import argparse
 import json
 import sys

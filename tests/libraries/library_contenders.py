@@ -10,7 +10,6 @@ from __future__ import annotations
 from functools import partial
 from typing import Any
 
-import ray
 from gymnasium.vector import AsyncVectorEnv, AutoresetMode
 from planned_environment import Actor, PlannedEnvironment
 from ray.rllib.env.env_runner_group import EnvRunnerGroup
@@ -18,7 +17,7 @@ from rllib_policy import runner_settings
 
 from t6gps.service.bench.contenders import Job
 from t6gps.service.bench.tally import Tally
-from t6gps.service.ray_backend.cluster import join_or_start
+from t6gps.service.ray_backend.cluster import connection
 
 
 def async_vector_env(job: Job) -> Tally:
@@ -37,8 +36,7 @@ def async_vector_env(job: Job) -> Tally:
 
 def rllib(job: Job) -> Tally:
     """RLlib's EnvRunnerGroup, asked as IMPALA asks it."""
-    join_or_start(job.config)
-    try:
+    with connection(job.config):
         runners = EnvRunnerGroup(config=runner_settings(job), local_env_runner=False)
         tally = Tally(job.seconds)
         while not tally.is_over:
@@ -48,5 +46,3 @@ def rllib(job: Job) -> Tally:
             for episodes in ready:
                 tally.add(sum(len(episode) for episode in episodes))
         return tally
-    finally:
-        ray.shutdown()

@@ -28,7 +28,7 @@ TINY = [
 
 def t6gps(*arguments: str | Path, root: Path, code: int = 0) -> subprocess.CompletedProcess[bytes]:
     """Run the command in a process of its own."""
-    command = [sys.executable, "-m", "t6gps.service.cli.main", *map(str, arguments), "--root", str(root)]
+    command = [sys.executable, "-m", "t6gps", *map(str, arguments), "--root", str(root)]
     done = subprocess.run(command, capture_output=True, check=False, timeout=300)
     assert done.returncode == code, done.stderr.decode() + done.stdout.decode()
     return done
@@ -163,7 +163,7 @@ def test_a_stopped_run_ends_within_seconds_and_resumes(
     settings = [*TINY, "--set=run.steps=250", "--set=run.episodes=40", "--set=run.iterations=1"]
     command = ["train", "flat-quick", "--run", "stopped", *executor, *settings]
     started = subprocess.Popen(
-        [sys.executable, "-m", "t6gps.service.cli.main", *command, "--root", str(tmp_path)],
+        [sys.executable, "-m", "t6gps", *command, "--root", str(tmp_path)],
         stderr=subprocess.PIPE,
         start_new_session=True,
     )

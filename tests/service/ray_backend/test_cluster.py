@@ -16,11 +16,16 @@ from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 
 
+def connect() -> None:
+    with cluster.connection(Config()):
+        pass
+
+
 @pytest.mark.parametrize("address", ["", "head", "head:", ":6379", "head:ray", "ray://head:10001"])
 def test_what_is_no_address_of_a_head_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("RAY_ADDRESS", address)
     with pytest.raises(RunError, match="RAY_ADDRESS must be HOST:PORT"):
-        cluster.join_or_start(Config())
+        connect()
 
 
 def test_an_address_at_which_nobody_listens_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
@@ -28,7 +33,7 @@ def test_an_address_at_which_nobody_listens_is_refused_at_once(monkeypatch: pyte
         port = taken.getsockname()[1]
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{port}")
     with pytest.raises(RunError, match=f"no Ray answers at RAY_ADDRESS=127.0.0.1:{port}"):
-        cluster.join_or_start(Config())
+        connect()
     assert not ray.is_initialized()
 
 

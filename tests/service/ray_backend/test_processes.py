@@ -14,7 +14,7 @@ from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 
 TRAIN = [
-    sys.executable, "-m", "t6gps.service.cli.main", "train", "flat-quick", "--run", "watched", "--workers", "1",
+    sys.executable, "-m", "t6gps", "train", "flat-quick", "--run", "watched", "--workers", "1",
     "--set=run.episodes=200", "--set=run.iterations=1",
 ]  # fmt: skip
 LISTENING, LOOPBACK = "0A", ("0100007F", "0000000000000000FFFF00000100007F", "00000000000000000000000001000000")

@@ -163,7 +163,7 @@ def test_the_folder_holds_tables_figures_and_how_they_were_made(
     with (tmp_path / "out" / "table.csv").open() as file:
         rows = {row["arm"]: row for row in csv.DictReader(file)}
     for outcome in finished:
-        mean = outcome.evaluation["forward_speed_m_per_s"]["mean"]
+        mean = outcome.evaluation.forward_speed_m_per_s.mean
         assert float(rows[outcome.trial.arm]["forward_speed_m_per_s"]) == pytest.approx(mean)
         assert rows[outcome.trial.arm]["forward_speed_m_per_s_deviation"] == ""
     page = (tmp_path / "out" / "README.md").read_text()
@@ -259,9 +259,9 @@ def test_a_baseline_is_evaluated_on_the_episodes_of_its_run_and_kept(baseline: B
     first = conduct.conduct(planned, tmp_path, "baselines", study.conditions, True, Listener())
     again = conduct.conduct(planned, tmp_path, "baselines", study.conditions, True, Listener())
     assert first == again
-    assert first[0].evaluation["episodes"] == 2
-    assert first[0].evaluation["forward_speed_m_per_s"]["standard_error"] > 0
-    assert first[0].conditions["one-way"]["forward_speed_m_per_s"]["standard_error"] == 0
+    assert first[0].evaluation.episodes == 2
+    assert first[0].evaluation.forward_speed_m_per_s.standard_error > 0
+    assert first[0].conditions["one-way"].forward_speed_m_per_s.standard_error == 0
     assert report.arm_rows(first)[0]["steps"] == (0 if baseline is Baseline.FLOP else 1250)
     files = report.write(tmp_path / "out", "baselines", study, ["t6gps", "study", "baselines"], first)
     assert {file.stem for file in files if file.suffix == ".png"} == {"evaluations", "conditions"}

@@ -307,7 +307,7 @@ def test_the_benchmark_compares_motions_that_agree() -> None:
 
 
 def _t6gps(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "t6gps.service.cli.main", *map(str, arguments)]
+    command = [sys.executable, "-m", "t6gps", *map(str, arguments)]
     done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
     assert done.returncode == code, done.stderr + done.stdout
     return done
