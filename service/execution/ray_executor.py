@@ -9,7 +9,6 @@ import time
 from collections.abc import Sequence
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Any
 
 import ray
 
@@ -27,6 +26,7 @@ from t6gps.service.pool.decision_log import DecisionLog
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.state import PoolState, RunState
 from t6gps.service.ray_backend import cluster
+from t6gps.service.ray_backend.cluster import Reference
 from t6gps.service.ray_backend.transport import RayTransport, SharedEpisode
 from t6gps.service.ray_backend.worker_actor import MakeWorker
 from t6gps.storage.catalog import Run
@@ -120,7 +120,7 @@ class RayExecutor(Executor):
                 self.pool.close(outcome, "" if outcome is RunState.DONE else "the run was stopped")
                 self.replace_learner()
 
-    def _until_done(self, reference: Any) -> None:
+    def _until_done(self, reference: Reference) -> None:
         """Wait for the learner, and tend the pool meanwhile."""
         self.pool.wait("the run", "the learner", True)
         while not ray.wait([reference], timeout=control.TICK_S)[0]:

@@ -22,7 +22,7 @@ from t6gps.learner.rows import AnyArray
 from t6gps.service import threads
 from t6gps.service.config import Config
 from t6gps.service.pool import control
-from t6gps.service.ray_backend.cluster import start_actor
+from t6gps.service.ray_backend.cluster import Reference, start_actor
 from t6gps.service.ray_backend.worker_actor import Answer
 from t6gps.storage import ipc, spool
 from t6gps.storage.catalog import Run
@@ -84,12 +84,12 @@ class RayLearner:
     until_done   waits for a reference to be there, and tends the pool meanwhile
     """
 
-    def __init__(self, config: Config, node: str, until_done: Callable[[Any], None]) -> None:
+    def __init__(self, config: Config, node: str, until_done: Callable[[Reference], None]) -> None:
         self.actor = start_actor(LearnerActor, config, where=node)
         self._until_done = until_done
-        self._taken: list[Any] = []
+        self._taken: list[Reference] = []
 
-    def add(self, reference: Any) -> None:
+    def add(self, reference: Reference) -> None:
         """Send an episode by its reference in the object store; waits while too many are on their way.
 
         How it went is asked by `learn`: sampling goes on when the learner has died.
@@ -139,11 +139,11 @@ class RayLearner:
         """End its process at once."""
         ray.kill(self.actor)
 
-    def _answer(self, reference: Any) -> Any:
+    def _answer(self, reference: Reference) -> Any:
         self._until_done(reference)
         return self._value(reference)
 
-    def _value(self, reference: Any) -> Any:
+    def _value(self, reference: Reference) -> Any:
         """The value behind a reference, or values behind a list of them."""
         try:
             return _get(reference)
@@ -153,7 +153,7 @@ class RayLearner:
             raise
 
 
-def _get(reference: Any) -> Any:
+def _get(reference: Reference) -> Any:
     """The value behind a reference. An error of this package comes as itself, the death of a process as RunError."""
     try:
         return ray.get(reference)
@@ -191,7 +191,7 @@ def _task_map(width: int) -> Callable[..., Iterator[Any]]:
 
     def task_map(function: Callable[[Any], Any], jobs: Iterable[Any]) -> Iterator[Any]:
         task = ray.remote(num_cpus=0, max_retries=3)(_with_one_thread(function))
-        pending: deque[Any] = deque()
+        pending: deque[Reference] = deque()
         for job in jobs:
             pending.append(task.remote(job))
             if len(pending) == width:

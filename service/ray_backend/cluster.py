@@ -13,7 +13,7 @@ import secrets
 import socket
 from collections.abc import Iterator
 from contextlib import contextmanager
-from typing import Any
+from typing import Any, TypeAlias
 
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
@@ -27,6 +27,10 @@ OBJECT_STORE_BYTES = 2 * 1024**3
 CONNECT_DEADLINE_S = 10.0
 """How long the head of a cluster has to answer."""
 SPREAD = "SPREAD"
+Actor: TypeAlias = Any
+"""A handle to an actor: Ray makes the methods of it."""
+Reference: TypeAlias = Any
+"""Where a value lies, or will lie, in Ray's object store."""
 
 
 def embedded_environment() -> dict[str, str]:
@@ -90,7 +94,7 @@ def _join_or_start(config: Config) -> int:
     return int(cpus_n / each + 1e-6)
 
 
-def start_actor(plain: type, *arguments: Any, cpus: float = 0, where: str = SPREAD) -> Any:
+def start_actor(plain: type, *arguments: Any, cpus: float = 0, where: str = SPREAD) -> Actor:
     """A handle to an actor made from a plain class, on the node `where` (or spread over all).
 
     Ray restarts none: what an actor held would be lost unnoticed.

@@ -9,13 +9,13 @@ from __future__ import annotations
 import logging
 import time
 from concurrent.futures import Future
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import ray
 
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.ray_backend import processes
-from t6gps.service.ray_backend.cluster import start_actor
+from t6gps.service.ray_backend.cluster import Actor, start_actor
 from t6gps.service.ray_backend.processes import Process
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
@@ -53,7 +53,7 @@ def newest(held: dict[int, PolicySnapshot]) -> dict[int, PolicySnapshot]:
 class PolicySource(NamedTuple):
     """Where a worker pulls: the server's actor, and how many there were before it."""
 
-    actor: Any
+    actor: Actor
     number: int
 
 

@@ -20,7 +20,7 @@ from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
 from t6gps.service.pool.state import WorkerId
 from t6gps.service.pool.transport import Done, Report, Transport
 from t6gps.service.ray_backend import cluster, node_agent, private, processes
-from t6gps.service.ray_backend.cluster import start_actor
+from t6gps.service.ray_backend.cluster import Actor, Reference, start_actor
 from t6gps.service.ray_backend.node_agent import NodeAgentActor
 from t6gps.service.ray_backend.policy_server import PolicyServer
 from t6gps.service.ray_backend.processes import Process
@@ -36,7 +36,7 @@ _log = logging.getLogger(__name__)
 class SharedEpisode(Episode):
     """An episode that lies in Ray's object store: `reference` leads another process to its `worker_actor.Answer`."""
 
-    reference: Any = None
+    reference: Reference = None
 
 
 @dataclass
@@ -46,7 +46,7 @@ class Remote:
     exited   it died by leaving, as Ray has seen, or for want of memory
     """
 
-    actor: Any
+    actor: Actor
     process: Process | None = None
     node: str = ""
     died: bool = False
@@ -58,7 +58,7 @@ class Call:
     """A call of a worker's actor: `plan` where it runs one."""
 
     worker: WorkerId
-    reference: Any
+    reference: Reference
     plan: EpisodePlan | None = None
 
 
@@ -74,7 +74,7 @@ class RayTransport(Transport):
         self._make_worker, self._settings, self._cpus = make_worker, settings, cpus_per_worker
         self._timings = timings
         self._node, self._logs = cluster.this_node(), private.logs_folder()
-        self._agents: dict[str, Any] = {}
+        self._agents: dict[str, Actor] = {}
         self._remotes: dict[WorkerId, Remote] = {}
         self._over: SimpleQueue[tuple[Call, Future[Any]]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
@@ -83,7 +83,7 @@ class RayTransport(Transport):
         actor = start_actor(WorkerActor, cpus=self._cpus)
         self._begin(worker, Remote(actor), actor.open.remote(self._make_worker, self._settings))
 
-    def _begin(self, worker: WorkerId, remote: Remote, opened: Any) -> None:
+    def _begin(self, worker: WorkerId, remote: Remote, opened: Reference) -> None:
         self._remotes[worker] = remote
         self._await(Call(worker, opened))
 
