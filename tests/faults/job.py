@@ -14,7 +14,7 @@ from pathlib import Path
 from house import House, policy
 
 from t6gps.service import seeding
-from t6gps.service.execution.executor import Ending
+from t6gps.service.pool.state import RunState
 from t6gps.storage import catalog
 from t6gps.storage.spool import Spool
 
@@ -29,7 +29,7 @@ def main(root: Path) -> None:
             executor.sample(seeding.training_plans(house.config, iteration), policy(iteration), spool.append)
             if (root / "enough").exists():
                 break
-        executor.close(Ending.DONE)
+        executor.close(RunState.DONE)
 
 
 if __name__ == "__main__":
