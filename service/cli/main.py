@@ -10,6 +10,7 @@ from __future__ import annotations
 import json
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -46,10 +47,10 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
 
 
-def main() -> None:
-    """Entry point of the command."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Entry point of the command; the arguments are those of the process where none are given."""
     try:
-        app()
+        app(arguments)
     except T6GpsError as error:
         message = str(error)
     except OSError as error:

@@ -19,7 +19,8 @@ from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.state import RunState, Worker
-from t6gps.service.ray_backend import cluster
+from t6gps.service.ray_backend import private
+from t6gps.service.ray_backend.cluster import this_node
 from t6gps.storage import catalog, schema
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import stub
@@ -39,18 +40,38 @@ QUICK_HEALTH_CHECKS = {
 """For a cluster's head: a node that dies or is cut off is noticed within seconds."""
 
 START_ATTEMPTS_N = 4
-NODE = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
+NODE = {"include_dashboard": False, "node_ip_address": "127.0.0.1"}
 
 
-def add_node(nodes: Cluster) -> None:
-    """Add a node of one CPU, the head first. Ray gives it half a minute to start, which is short on a busy machine."""
+def add_node(nodes: Cluster, cpus: int = 1) -> None:
+    """Add a node, the head first. Ray gives it half a minute to start, which is short on a busy machine."""
     for attempt in range(START_ATTEMPTS_N):
         try:
-            nodes.add_node(**NODE)
+            nodes.add_node(num_cpus=cpus, **NODE)
             return
         except Exception as error:  # Ray has no narrower one
             if "timed out during startup" not in str(error) or attempt == START_ATTEMPTS_N - 1:
                 raise
+
+
+@contextmanager
+def joining(address: str) -> Iterator[None]:
+    """Executors that start meanwhile join the Ray at an address."""
+    with pytest.MonkeyPatch.context() as environment:
+        environment.setenv("RAY_ADDRESS", address)
+        yield
+
+
+@contextmanager
+def head() -> Iterator[str]:
+    """The address of a Ray of two CPUs on the loopback address."""
+    private.prepare_start()
+    cluster = Cluster()
+    try:
+        add_node(cluster, cpus=2)
+        yield cluster.address
+    finally:
+        cluster.shutdown()
 
 
 @contextmanager
@@ -59,20 +80,20 @@ def three_nodes() -> Iterator[Cluster]:
     with pytest.MonkeyPatch.context() as environment:
         for name, value in QUICK_HEALTH_CHECKS.items():
             environment.setenv(name, value)
-        found = Cluster()
+        cluster = Cluster()
         try:
             for _ in range(3):
-                add_node(found)
-            environment.setenv("RAY_ADDRESS", found.address)
-            yield found
+                add_node(cluster)
+            environment.setenv("RAY_ADDRESS", cluster.address)
+            yield cluster
         finally:
             ray.shutdown()
-            found.shutdown()
+            cluster.shutdown()
 
 
 def others(nodes: Cluster) -> dict[str, Any]:
     """Nodes that the run can do without, by their names: neither the head nor the supervisor's."""
-    return {node.node_id: node for node in nodes.worker_nodes if node.node_id != cluster.this_node()}
+    return {node.node_id: node for node in nodes.worker_nodes if node.node_id != this_node()}
 
 
 class House:
@@ -102,14 +123,14 @@ class House:
         self, plans: list[EpisodePlan], after_each: Callable[[list[Episode]], None] = lambda _: None
     ) -> list[Episode]:
         """Plans of the same batch."""
-        found: list[Episode] = []
+        sampled: list[Episode] = []
 
         def keep(episode: Episode) -> None:
-            found.append(episode)
-            after_each(found)
+            sampled.append(episode)
+            after_each(sampled)
 
         self.executor.sample(plans, policy(self.iteration), keep)
-        return found
+        return sampled
 
     @property
     def plans(self) -> list[EpisodePlan]:
@@ -125,12 +146,12 @@ class House:
         pool.tick(0.02)
         return len(self.workers) == n and pool.state.condition is RunState.RUNNING
 
-    def check(self, found: list[Episode], without: tuple[int, ...] = ()) -> None:
+    def check(self, sampled: list[Episode], without: tuple[int, ...] = ()) -> None:
         """Every planned episode is there once, and it is what the plan alone makes of it."""
-        numbers = [episode.episode_id for episode in found]
+        numbers = [episode.episode_id for episode in sampled]
         expected = {plan.episode_id: plan for plan in self.plans if plan.episode_id not in without}
         assert sorted(numbers) == sorted(expected)
-        for number, episode in zip(numbers, found, strict=True):
+        for number, episode in zip(numbers, sampled, strict=True):
             alone = stub.episode(expected[number], policy(self.iteration))
             assert episode.frames.equals(alone.frames)
             assert episode.summary.equals(alone.summary)

@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ray
+from house import joining
 
 from t6gps.learner import policy
 from t6gps.service import seeding
@@ -119,8 +120,9 @@ def _available() -> dict[str, float]:
 
 
 @pytest.fixture
-def soak(tmp_path: Path) -> Iterator[Soak]:
-    soak = Soak(tmp_path)
+def soak(ray_head: str, tmp_path: Path) -> Iterator[Soak]:
+    with joining(ray_head):
+        soak = Soak(tmp_path)
     with catalog.locked(soak.run):
         try:
             yield soak
