@@ -9,7 +9,6 @@ import pytest
 from run_digest import digests
 from tiny_run import TINY, Trained, Watcher
 
-from t6gps.learner import value
 from t6gps.service.config import Config, load
 from t6gps.service.execution.executor import Keep, Purpose
 from t6gps.service.execution.serial import SerialExecutor
@@ -86,17 +85,14 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
     assert [row["iteration"] for row in watcher.rows] == [0, 1, 2][-len(watcher.rows) :]
 
 
-@pytest.mark.parametrize("stop", [{"episodes": 7}, {"phase": "backward_pass"}])
-def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: dict[str, Any]
-) -> None:
-    for name in ("STEPS", "FIRST_STEPS"):
-        monkeypatch.setattr(value, name, value.PREPARED_N)
+def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(tmp_path: Path) -> None:
     config = load("flat-quick", [*TINY, "learner.value_from=1"])
     whole, stopped = (catalog.create(tmp_path, name, config.to_json()) for name in ("whole", "stopped"))
     trained(config, whole, SerialExecutor(config))
-    with pytest.raises(KeyboardInterrupt):
-        trained(config, stopped, StopsAfter(config, **stop))
+    for stop in (StopsAfter(config, phase="backward_pass"), StopsAfter(config, episodes=1)):  # iterations 1 and 2
+        with pytest.raises(KeyboardInterrupt):
+            trained(config, stopped, stop)
+    assert tables.committed_iterations(stopped) == 2
     trained(config, stopped, SerialExecutor(config))
     assert digests(stopped.path) == digests(whole.path)
 

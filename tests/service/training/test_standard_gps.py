@@ -79,7 +79,7 @@ def test_every_direction_is_a_class_and_every_time_step_a_model(
     rows = standard_gps.read_rows(episodes, CABLE_MAP)
     assert rows.entry.reshape(12, -1).tolist() == [[row] * (STEPS + 1) for row in rows.entry[:: STEPS + 1]]
     assert (rows.exit == NONE).all()
-    learner = executor._learner
+    learner = executor.learner
     for frames in episodes.values():
         learner.add(frames)
     for phase in ("segment", "fit", "backward_pass", "supervise"):
