@@ -1,6 +1,6 @@
 """Soak: workers are killed, stopped and scaled at random for minutes; nothing is lost, and nothing grows.
 
-T6GPS_SOAK_MINUTES says how long, two minutes by default; `make soak` takes thirty and prints the figures.
+T6GPS_SOAK_MINUTES says how long, one minute by default; `make soak` takes thirty and prints the figures.
 """
 
 from __future__ import annotations
@@ -30,13 +30,14 @@ from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.stub import StubWorker
 
-MINUTES = float(os.environ.get("T6GPS_SOAK_MINUTES", "2"))
+MINUTES = float(os.environ.get("T6GPS_SOAK_MINUTES", "1"))
 CONFIG = {"run": {"episodes": 100, "steps": 250, "workers": 2, "cpus_per_worker": 0.5}}
-EPISODE_S, FAULT_EVERY_S, SAMPLE_EVERY_S = 0.1, 8.0, 2.0
+EPISODE_S, FAULT_EVERY_S, SAMPLE_EVERY_S = 0.1, 4.0, 1.0
 FAULTS = ("kill", "stop", "scale")
 WARM_UP = 0.4
 """Share of the time that is not measured: the first grown and killed workers fill pools and caches."""
-STEEPEST_MB_PER_MIN = 1.0
+STEEPEST_MB_PER_MIN, CACHES_MB = 1.0, 2.0
+"""What a process may grow by, and what it may in a soak too short to tell: 2% of the episodes are more."""
 
 
 class Soak:
@@ -161,8 +162,8 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
     assert ledger.counters["committed"] == committed_n
     assert ledger.counters["quarantined"] == 0
     assert soak.faults["kill"] + soak.faults["stop"] > 2
-    assert figures["policy_server_mb"] < STEEPEST_MB_PER_MIN
-    assert figures["driver_mb"] < STEEPEST_MB_PER_MIN
+    for name in ("driver_mb", "policy_server_mb"):
+        assert figures[name] * MINUTES < max(STEEPEST_MB_PER_MIN * MINUTES, CACHES_MB)
     for name in ("driver_threads", "driver_descriptors", "policy_server_threads", "policy_server_descriptors"):
         assert figures[name] * MINUTES < 10  # in the whole time; a leak of one at every fault would be more
     assert soak.measured[-1]["object_store_mb"] < 50
