@@ -55,7 +55,7 @@ def everything(ray_head: str, tmp_path_factory: pytest.TempPathFactory) -> Itera
 @pytest.fixture
 def house(everything: House, wait_until: Callable[..., None]) -> House:
     """Two workers, ready."""
-    wait_until(lambda: everything.ready(2), 90)
+    wait_until(lambda: everything.ready(2), 240)
     return everything
 
 
@@ -90,7 +90,7 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
         killing.start()
         house.check(house.sample())
         killing.join()
-        wait_until(lambda gone=victim: house.ready(2) and gone not in map(pid, house.workers), 90)
+        wait_until(lambda gone=victim: house.ready(2) and gone not in map(pid, house.workers), 240)
     assert house.executor.pool.state.counters["crashed"] == crashed_n + KILLS_N
     assert len(house.executor.ledger.quarantined) == quarantined_n
 
@@ -171,7 +171,7 @@ def test_t4_all_workers_die_at_once_and_the_run_recovers(house: House, wait_unti
 
     house.check(house.sample(kill_all))
     assert house.executor.pool.state.counters["crashed"] == crashed_n + 2
-    wait_until(lambda: house.ready(2), 90)
+    wait_until(lambda: house.ready(2), 240)
 
 
 def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: House) -> None:
@@ -181,14 +181,14 @@ def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: 
     def scale() -> None:
         try:
             for request in (1, 3, 1, 2):
-                assert control.scale(house.run, request, 90)["ready"] == request
+                assert control.scale(house.run, request, 240)["ready"] == request
                 reached.append(request)
         except Exception as error:  # told by the main thread
             failed.append(error)
 
     scaling = threading.Thread(target=scale)
     scaling.start()
-    deadline_s = time.monotonic() + 300
+    deadline_s = time.monotonic() + 1000
     while scaling.is_alive():
         assert time.monotonic() < deadline_s
         house.check(house.sample())
@@ -232,7 +232,7 @@ def test_t9_the_policy_server_dies_and_is_back_with_the_newest(house: House, wai
             ray.kill(policies.source.actor)
 
     house.check(house.sample(kill))
-    wait_until(lambda: another_server(house, killed[0]), 30)
+    wait_until(lambda: another_server(house, killed[0]), 120)
     back = ray.get(policies.source.actor.pull.remote(house.iteration))
     assert policy_digest(back) == policy_digest(policy(house.iteration))
     with pytest.raises(RunError, match="versions only grow"):
@@ -260,8 +260,8 @@ def test_t9_a_policy_server_that_hangs_is_replaced_when_somebody_misses_it(
     assert house.executor.ledger.counters["failures"] == failures_n
     if who == "supervisor":
         house.check(house.sample())
-    wait_until(lambda: another_server(house, stopped), 30)
-    wait_until(lambda: not processes.command(stopped.pid), 10)
+    wait_until(lambda: another_server(house, stopped), 120)
+    wait_until(lambda: not processes.command(stopped.pid), 60)
 
 
 def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(house: House) -> None:
@@ -293,7 +293,7 @@ def test_what_workers_sample_ahead_is_kept_once_and_the_rest_is_left_to_the_next
         house.executor.tend()
         return len(kept) >= 5
 
-    wait_until(tended, 30)
+    wait_until(tended, 120)
     ahead = [episode.episode_id for episode in kept]
     missing = [plan for plan in house.plans if plan.episode_id not in ahead]
     house.check(kept + house.sample_again(missing))
@@ -329,7 +329,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
     def check(sampled: list[Episode]) -> None:
         if len(sampled) > 1:
             return
-        wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 90)  # with the one not kept yet
+        wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 240)  # with the one not kept yet
         status = control.status(house.run)
         assert (status["state"], status["ready"], status["wanted"], status["backlog"]) == ("RUNNING", 2, 2, 30)
         pids = {(worker.id.slot, pid(worker)) for worker in house.workers}
@@ -338,7 +338,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
 
     house.sample(check)
     waits = "2 workers wait for plans"
-    wait_until(told(lambda status: waits in [wait["what"] for wait in status["waits"]]), 90)
+    wait_until(told(lambda status: waits in [wait["what"] for wait in status["waits"]]), 240)
 
 
 def test_the_configuration_of_these_tests_is_one_a_run_could_keep() -> None:
