@@ -10,7 +10,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test view check bench bench-libraries soak clean
+.PHONY: install train test test-fast view check bench bench-libraries soak clean
 
 install: $(STAMP)
 
@@ -22,8 +22,12 @@ $(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch] */*/*/nati
 train: install
 	$(BIN)/t6gps train flat-quick
 
+# All tests, ten minutes on two cores; then those that need neither Ray nor a trained run, a minute.
 test: install
 	$(BIN)/pytest
+
+test-fast: install
+	$(BIN)/pytest -m "not slow and not ray"
 
 # The tree as `t6gps/...`, in links, for tools that do not know how the rooms are mapped into the package.
 view:

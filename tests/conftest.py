@@ -1,14 +1,17 @@
-"""What every room's tests share: one thread per library, and synthetic episodes that follow the schemas."""
+"""What every room's tests share: one thread per library, synthetic episodes, a trained run, a Ray to join, marks."""
 
 from __future__ import annotations
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from typing import Any
 
+import house
 import numpy as np
 import pyarrow as pa
 import pytest
+import tiny_run
+from tiny_run import Trained
 
 from t6gps.__main__ import use_one_thread
 from t6gps.service import threads
@@ -17,6 +20,16 @@ from t6gps.storage.records import Episode
 
 threads.limit()  # of the libraries that are loaded
 use_one_thread()  # of those to come, and in other processes
+IMPLIED_MARKS = {"ray_head": "ray", "nodes": "ray", "hosts": "ray", "tiny": "slow", "pair": "slow"}
+"""Marks of the tests that need a fixture."""
+
+
+def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
+    """Mark tests after what their fixtures need."""
+    for item in items:
+        for fixture, mark in IMPLIED_MARKS.items():
+            if fixture in getattr(item, "fixturenames", ()):
+                item.add_marker(mark)
 
 
 def _column(field: pa.Field, rows: int, rng: np.random.Generator) -> pa.Array:
@@ -86,3 +99,16 @@ def wait_until() -> Callable[..., None]:
             time.sleep(0.02)  # other processes bring the condition about: there is nothing to wait on but the clock
 
     return wait
+
+
+@pytest.fixture(scope="session")
+def tiny(tmp_path_factory: pytest.TempPathFactory) -> Trained:
+    """A finished run; no test changes it."""
+    return tiny_run.train(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(scope="session")
+def ray_head() -> Iterator[dict[str, str]]:
+    """The variables that lead to a Ray of two CPUs, which tests join and leave as it is; see `house.joining`."""
+    with house.started([2]) as (_, environment):
+        yield environment

@@ -18,7 +18,7 @@ CROWDED_FOLDERS: set[str] = set()
 LONG_CLASSES: set[str] = set()
 LONG_FUNCTIONS: set[str] = set()
 ANY_MOST_N = 60
-PRIVATE_MEMBERS_MOST_N = 5
+PRIVATE_MEMBERS_MOST_N, PATCHES_MOST_N = 5, 8
 
 
 def parsed(folders: Iterator[Path]) -> dict[str, ast.Module]:
@@ -53,6 +53,15 @@ def private_members(tree: ast.Module) -> list[str]:
     ]
 
 
+def patches(tree: ast.Module) -> list[str]:
+    """Calls that replace what a module or class holds: `monkeypatch.setattr`. Parameters and hooks are better."""
+    return [
+        ast.unparse(node)
+        for node in ast.walk(tree)
+        if isinstance(node, ast.Call) and isinstance(node.func, ast.Attribute) and node.func.attr == "setattr"
+    ]
+
+
 def test_no_folder_is_crowded() -> None:
     folders: dict[str, int] = {}
     for module in PACKAGE:
@@ -82,3 +91,8 @@ def test_tests_reach_into_few_objects() -> None:
     assert sum(map(len, reached.values())) <= PRIVATE_MEMBERS_MOST_N, {
         m: names for m, names in reached.items() if names
     }
+
+
+def test_tests_patch_little() -> None:
+    patched = {module: patches(tree) for module, tree in TESTS.items()}
+    assert sum(map(len, patched.values())) <= PATCHES_MOST_N, {m: calls for m, calls in patched.items() if calls}

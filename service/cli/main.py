@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import shlex
 import sys
+from collections.abc import Sequence
 from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NoReturn
@@ -43,10 +44,10 @@ app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 
 
-def main() -> None:
-    """Run the command; `t6gps.__main__` has prepared the process."""
+def main(arguments: Sequence[str] | None = None) -> None:
+    """Run the command; `t6gps.__main__` has prepared the process, whose arguments are taken where none are given."""
     try:
-        app()
+        app(arguments)
     except T6GpsError as error:
         message = str(error)
     except OSError as error:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -39,14 +39,14 @@ QUICK_HEALTH_CHECKS = {
 """For a cluster's head: a node that dies or is cut off is noticed within seconds."""
 
 START_ATTEMPTS_N = 4
-NODE = {"num_cpus": 1, "include_dashboard": False, "node_ip_address": "127.0.0.1"}
+NODE = {"include_dashboard": False, "node_ip_address": "127.0.0.1"}
 
 
-def add_node(nodes: Cluster) -> None:
-    """Add a node of one CPU, the head first. Ray gives it half a minute to start, which is short on a busy machine."""
+def add_node(nodes: Cluster, cpus: int = 1) -> None:
+    """Add a node, the head first. Ray gives it half a minute to start, which is short on a busy machine."""
     for attempt in range(START_ATTEMPTS_N):
         try:
-            nodes.add_node(**NODE)
+            nodes.add_node(num_cpus=cpus, **NODE)
             return
         except Exception as error:  # Ray has no narrower one
             if "timed out during startup" not in str(error) or attempt == START_ATTEMPTS_N - 1:
@@ -54,21 +54,37 @@ def add_node(nodes: Cluster) -> None:
 
 
 @contextmanager
-def three_nodes() -> Iterator[Cluster]:
-    """A cluster of three nodes of one CPU on this machine, to which RAY_ADDRESS leads."""
-    with pytest.MonkeyPatch.context() as environment:
-        for name, value in (cluster.embedded_environment() | QUICK_HEALTH_CHECKS).items():
-            environment.setenv(name, value)
+def joining(environment: Mapping[str, str]) -> Iterator[None]:
+    """Executors that start meanwhile join the Ray that these variables lead to."""
+    with pytest.MonkeyPatch.context() as patch:
+        for name, value in environment.items():
+            patch.setenv(name, value)
+        yield
+
+
+@contextmanager
+def started(cpus_of_nodes: Sequence[int], **settings: str) -> Iterator[tuple[Cluster, dict[str, str]]]:
+    """A Ray on the loopback address with a node for each entry, and the variables that lead to it."""
+    environment = cluster.embedded_environment() | settings
+    with private.adapted(), joining(environment):
         private.read_authentication()
-        found = Cluster()
+        nodes = Cluster()
+        for cpus in cpus_of_nodes:
+            add_node(nodes, cpus)
+    try:
+        yield nodes, environment | {"RAY_ADDRESS": nodes.address}
+    finally:
+        nodes.shutdown()
+
+
+@contextmanager
+def three_nodes() -> Iterator[Cluster]:
+    """A cluster of three nodes of one CPU on this machine, which executors join meanwhile."""
+    with started([1, 1, 1], **QUICK_HEALTH_CHECKS) as (nodes, environment), joining(environment):
         try:
-            for _ in range(3):
-                add_node(found)
-            environment.setenv("RAY_ADDRESS", found.address)
-            yield found
+            yield nodes
         finally:
             ray.shutdown()
-            found.shutdown()
 
 
 def others(nodes: Cluster) -> dict[str, Any]:
@@ -103,14 +119,14 @@ class House:
         self, plans: list[EpisodePlan], after_each: Callable[[list[Episode]], None] = lambda _: None
     ) -> list[Episode]:
         """Plans of the same batch."""
-        found: list[Episode] = []
+        sampled: list[Episode] = []
 
         def keep(episode: Episode) -> None:
-            found.append(episode)
-            after_each(found)
+            sampled.append(episode)
+            after_each(sampled)
 
         self.executor.sample(plans, policy(self.iteration), keep)
-        return found
+        return sampled
 
     @property
     def plans(self) -> list[EpisodePlan]:
@@ -126,12 +142,12 @@ class House:
         pool.tick(0.02)
         return len(self.workers) == n and pool.state.condition is RunState.RUNNING
 
-    def check(self, found: list[Episode], without: tuple[int, ...] = ()) -> None:
+    def check(self, sampled: list[Episode], without: tuple[int, ...] = ()) -> None:
         """Every planned episode is there once, and it is what the plan alone makes of it."""
-        numbers = [episode.episode_id for episode in found]
+        numbers = [episode.episode_id for episode in sampled]
         expected = {plan.episode_id: plan for plan in self.plans if plan.episode_id not in without}
         assert sorted(numbers) == sorted(expected)
-        for number, episode in zip(numbers, found, strict=True):
+        for number, episode in zip(numbers, sampled, strict=True):
             alone = stub.episode(expected[number], policy(self.iteration))
             assert episode.frames.equals(alone.frames)
             assert episode.summary.equals(alone.summary)

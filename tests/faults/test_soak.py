@@ -1,6 +1,6 @@
 """Soak: workers are killed, stopped and scaled at random for minutes; nothing is lost, and nothing grows.
 
-T6GPS_SOAK_MINUTES says how long, two minutes by default; `make soak` takes thirty and prints the figures.
+T6GPS_SOAK_MINUTES says how long, one minute by default; `make soak` takes thirty and prints the figures.
 """
 
 from __future__ import annotations
@@ -17,6 +17,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 import ray
+from house import joining
 
 from t6gps.learner import policy
 from t6gps.service import seeding
@@ -29,13 +30,16 @@ from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.stub import StubWorker
 
-MINUTES = float(os.environ.get("T6GPS_SOAK_MINUTES", "2"))
+MINUTES = float(os.environ.get("T6GPS_SOAK_MINUTES", "1"))
 CONFIG = {"run": {"episodes": 100, "steps": 250, "workers": 2, "cpus_per_worker": 0.5}}
-EPISODE_S, FAULT_EVERY_S, SAMPLE_EVERY_S = 0.1, 8.0, 2.0
+EPISODE_S, FAULT_EVERY_S, SAMPLE_EVERY_S = 0.1, 4.0, 1.0
 FAULTS = ("kill", "stop", "scale")
+LEAST_FAULTS_N = 3
+"""A soak lasts until so many workers were killed or stopped: on a busy machine they take longer to recover."""
 WARM_UP = 0.4
 """Share of the time that is not measured: the first grown and killed workers fill pools and caches."""
-STEEPEST_MB_PER_MIN = 1.0
+STEEPEST_MB_PER_MIN, CACHES_MB = 1.0, 2.0
+"""What a process may grow by, and what it may in a soak too short to tell: 2% of the episodes are more."""
 
 
 class Soak:
@@ -99,14 +103,14 @@ class Soak:
         server = self.executor.transport.policies.process
         assert server is not None
         pids = {"driver": os.getpid(), "policy_server": server.pid}
-        found = {"time_min": now / 60}
+        row = {"time_min": now / 60}
         for role, pid in pids.items():
             status = dict(line.split(":", 1) for line in Path(f"/proc/{pid}/status").read_text().splitlines())
-            found[f"{role}_mb"] = int(status["RssAnon"].split()[0]) / 1024
-            found[f"{role}_threads"] = int(status["Threads"])
-            found[f"{role}_descriptors"] = len(list(Path(f"/proc/{pid}/fd").iterdir()))
+            row[f"{role}_mb"] = int(status["RssAnon"].split()[0]) / 1024
+            row[f"{role}_threads"] = int(status["Threads"])
+            row[f"{role}_descriptors"] = len(list(Path(f"/proc/{pid}/fd").iterdir()))
         total, free = (numbers().get("object_store_memory", 0) for numbers in (ray.cluster_resources, _available))
-        return found | {"object_store_mb": (total - free) / 2**20}
+        return row | {"object_store_mb": (total - free) / 2**20}
 
     def slope_per_min(self, name: str) -> float:
         """Slope of a straight line through what was measured after the warm-up."""
@@ -119,8 +123,9 @@ def _available() -> dict[str, float]:
 
 
 @pytest.fixture
-def soak(tmp_path: Path) -> Iterator[Soak]:
-    soak = Soak(tmp_path)
+def soak(ray_head: dict[str, str], tmp_path: Path) -> Iterator[Soak]:
+    with joining(ray_head):
+        soak = Soak(tmp_path)
     with catalog.locked(soak.run):
         try:
             yield soak
@@ -133,7 +138,7 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
     pool, ledger = soak.executor.pool, soak.executor.ledger
     untrained = policy.initial(schema.OBSERVATION_N, CABLES_N, [8], soak.rng, offset_m=1.0, scale_m=0.2)
     end_s, iteration, committed_n = time.monotonic() + 60 * MINUTES, 0, 0
-    while time.monotonic() < end_s:
+    while time.monotonic() < end_s or soak.faults["kill"] + soak.faults["stop"] < LEAST_FAULTS_N:
         plans: list[EpisodePlan] = seeding.training_plans(soak.config, iteration)
         numbers: list[int] = []
 
@@ -151,18 +156,17 @@ def test_t14_a_soak_loses_nothing_and_nothing_grows(soak: Soak, wait_until: Call
         phases = {worker.phase for worker in soak.workers.values()}
         return pool.state.condition is RunState.RUNNING and phases == {WorkerPhase.IDLE}
 
-    wait_until(at_rest, 60)
+    wait_until(at_rest, 240)
     figures = {name: soak.slope_per_min(name) for name in soak.measured[0] if name != "time_min"}
     kept = {"episodes": committed_n, **soak.faults, **pool.state.counters}
     waits = {f"{fault}_p95_s": np.quantile(took_s, 0.95) for fault, took_s in soak.took_s.items() if took_s}
     print(json.dumps({"minutes": MINUTES, **kept, **waits, "slopes_per_min": figures}, indent=1, default=float))
     assert ledger.counters["committed"] == committed_n
     assert ledger.counters["quarantined"] == 0
-    assert soak.faults["kill"] + soak.faults["stop"] > 2
-    assert figures["policy_server_mb"] < STEEPEST_MB_PER_MIN
-    assert figures["driver_mb"] < STEEPEST_MB_PER_MIN
+    for name in ("driver_mb", "policy_server_mb"):
+        assert figures[name] * MINUTES < max(STEEPEST_MB_PER_MIN * MINUTES, CACHES_MB)
     for name in ("driver_threads", "driver_descriptors", "policy_server_threads", "policy_server_descriptors"):
         assert figures[name] * MINUTES < 10  # in the whole time; a leak of one at every fault would be more
     assert soak.measured[-1]["object_store_mb"] < 50
     assert not ledger.leases
-    wait_until(lambda: _available()["CPU"] == ray.cluster_resources()["CPU"] - 0.5 * len(soak.workers), 30)
+    wait_until(lambda: _available()["CPU"] == ray.cluster_resources()["CPU"] - 0.5 * len(soak.workers), 120)

@@ -1,6 +1,6 @@
 """Laws of the pool under faults, with real processes that obey orders: what is planned is committed once, and the same.
 
-One Ray serves the module; the workers are stubs, so that an episode takes as long as a test wants.
+One executor serves the module; the workers are stubs, so that an episode takes as long as a test wants.
 """
 
 from __future__ import annotations
@@ -18,7 +18,7 @@ from typing import Any
 import numpy as np
 import pytest
 import ray
-from house import CONFIG, House, pid, policy
+from house import CONFIG, House, joining, pid, policy
 
 from t6gps.service.config import Config, parse
 from t6gps.service.pool import control, crash_bundle
@@ -36,13 +36,14 @@ from t6gps.workers.stub import StubWorker
 AT_LENGTH = "T6GPS_SOAK_MINUTES" in os.environ
 KILLS_N, PAUSE_S = (20, 60) if AT_LENGTH else (3, 3)
 """`make soak` does what the laws say, the suite enough to see them broken."""
-BOOK_S = 1.0
-"""A book takes half as long again."""
+BATCH_S = 1.0
+"""A batch takes half as long again."""
 
 
 @pytest.fixture(scope="module")
-def everything(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
-    house = House(tmp_path_factory.mktemp("faults"))
+def everything(ray_head: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+    with joining(ray_head):
+        house = House(tmp_path_factory.mktemp("faults"))
     with catalog.locked(house.run):
         try:
             house.check(house.sample())  # the deadlines are measured now
@@ -54,7 +55,7 @@ def everything(tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
 @pytest.fixture
 def house(everything: House, wait_until: Callable[..., None]) -> House:
     """Two workers, ready."""
-    wait_until(lambda: everything.ready(2), 90)
+    wait_until(lambda: everything.ready(2), 240)
     return everything
 
 
@@ -85,11 +86,11 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
     crashed_n, quarantined_n = house.executor.pool.state.counters["crashed"], len(house.executor.ledger.quarantined)
     for _ in range(KILLS_N):
         victim = pid(house.workers[rng.integers(2)])
-        killing = threading.Timer(rng.uniform(0.0, BOOK_S), os.kill, (victim, signal.SIGKILL))
+        killing = threading.Timer(rng.uniform(0.0, BATCH_S), os.kill, (victim, signal.SIGKILL))
         killing.start()
         house.check(house.sample())
         killing.join()
-        wait_until(lambda gone=victim: house.ready(2) and gone not in map(pid, house.workers), 90)
+        wait_until(lambda gone=victim: house.ready(2) and gone not in map(pid, house.workers), 240)
     assert house.executor.pool.state.counters["crashed"] == crashed_n + KILLS_N
     assert len(house.executor.ledger.quarantined) == quarantined_n
 
@@ -122,8 +123,7 @@ def test_t2_a_worker_that_hangs_is_found_replaced_and_its_stacks_kept(house: Hou
                 os.kill(pid(worker), signal.SIGSTOP)
 
     with after_every_tick(house, stop):
-        found = house.sample()
-    house.check(found)
+        house.check(house.sample())
     (failure,) = house.executor.ledger.failures[number]
     assert failure.kind == ("lost" if how == "SIGSTOP" else "hang")  # the episode is not to blame for a stop
     assert {"SIGSTOP": "SIGSTOP", "hang-in-c": "_hang_in_c", "hang-in-python": "_hang_in_python"}[how] in failure.trace
@@ -132,8 +132,7 @@ def test_t2_a_worker_that_hangs_is_found_replaced_and_its_stacks_kept(house: Hou
 
 def test_t3_an_episode_that_raises_three_times_is_left_out_and_can_be_replayed(house: House) -> None:
     number = house.order(4, "raise")
-    found = house.sample()
-    house.check(found, without=(number,))
+    house.check(house.sample(), without=(number,))
     kept = crash_bundle.read(house.run.bundles / f"episode-{number}.json")
     assert len(kept.failures) == 3
     assert kept.failures[0]["error"] == "PhysicsError"
@@ -165,14 +164,14 @@ def test_a_worker_that_dies_leaves_how_it_ended_and_its_log(house: House, how: s
 def test_t4_all_workers_die_at_once_and_the_run_recovers(house: House, wait_until: Callable[..., None]) -> None:
     crashed_n = house.executor.pool.state.counters["crashed"]
 
-    def kill_all(found: list[Episode]) -> None:
-        if len(found) == 5:
+    def kill_all(sampled: list[Episode]) -> None:
+        if len(sampled) == 5:
             for worker in house.workers:
                 os.kill(pid(worker), signal.SIGKILL)
 
     house.check(house.sample(kill_all))
     assert house.executor.pool.state.counters["crashed"] == crashed_n + 2
-    wait_until(lambda: house.ready(2), 90)
+    wait_until(lambda: house.ready(2), 240)
 
 
 def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: House) -> None:
@@ -182,14 +181,14 @@ def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: 
     def scale() -> None:
         try:
             for request in (1, 3, 1, 2):
-                assert control.scale(house.run, request, 90)["ready"] == request
+                assert control.scale(house.run, request, 240)["ready"] == request
                 reached.append(request)
         except Exception as error:  # told by the main thread
             failed.append(error)
 
     scaling = threading.Thread(target=scale)
     scaling.start()
-    deadline_s = time.monotonic() + 300
+    deadline_s = time.monotonic() + 1000
     while scaling.is_alive():
         assert time.monotonic() < deadline_s
         house.check(house.sample())
@@ -206,12 +205,13 @@ def test_a_request_that_is_not_allowed_changes_nothing(house: House) -> None:
     assert house.executor.pool.state.wanted == 2
 
 
-def test_t7_a_worker_with_another_policy_is_found_out(house: House, monkeypatch: pytest.MonkeyPatch) -> None:
+def test_t7_a_worker_with_another_policy_is_found_out(house: House) -> None:
     house.check(house.sample())  # digests of all workers are compared with every episode
-    with monkeypatch.context() as patch:
-        patch.setattr("t6gps.service.execution.ray_executor.policy_digest", lambda _: "another")
-        with pytest.raises(RunError, match="acted with another policy"):
-            house.sample()
+    policies, expected = house.executor.transport.policies, policy(house.iteration + 1)
+    policies.publish(expected)
+    ray.get(policies.source.actor.hold.remote(replace(expected, offset_m=2 * expected.offset_m)))
+    with pytest.raises(RunError, match="acted with another policy"):
+        house.sample()
     house.executor.pool.state.turn(RunState.DEGRADED, "")
     house.check(house.sample())
 
@@ -226,13 +226,13 @@ def test_t9_the_policy_server_dies_and_is_back_with_the_newest(house: House, wai
     policies = house.executor.transport.policies
     killed: list[Process] = []
 
-    def kill(found: list[Episode]) -> None:
-        if len(found) == 5 and policies.process is not None:
+    def kill(sampled: list[Episode]) -> None:
+        if len(sampled) == 5 and policies.process is not None:
             killed.append(policies.process)
             ray.kill(policies.source.actor)
 
     house.check(house.sample(kill))
-    wait_until(lambda: another_server(house, killed[0]), 30)
+    wait_until(lambda: another_server(house, killed[0]), 120)
     back = ray.get(policies.source.actor.pull.remote(house.iteration))
     assert policy_digest(back) == policy_digest(policy(house.iteration))
     with pytest.raises(RunError, match="versions only grow"):
@@ -249,8 +249,8 @@ def test_t9_a_policy_server_that_hangs_is_replaced_when_somebody_misses_it(
     stopped = policies.process
     assert stopped is not None
 
-    def stop(found: list[Episode]) -> None:
-        if len(found) == 1:
+    def stop(sampled: list[Episode]) -> None:
+        if len(sampled) == 1:
             os.kill(stopped.pid, signal.SIGSTOP)
             if who == "worker":
                 for worker in house.workers:
@@ -260,26 +260,26 @@ def test_t9_a_policy_server_that_hangs_is_replaced_when_somebody_misses_it(
     assert house.executor.ledger.counters["failures"] == failures_n
     if who == "supervisor":
         house.check(house.sample())
-    wait_until(lambda: another_server(house, stopped), 30)
-    wait_until(lambda: not processes.command(stopped.pid), 10)
+    wait_until(lambda: another_server(house, stopped), 120)
+    wait_until(lambda: not processes.command(stopped.pid), 60)
 
 
 def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(house: House) -> None:
     pool, ledger = house.executor.pool, house.executor.ledger
     most = bytes_ = 0
 
-    def pause(found: list[Episode]) -> None:
+    def pause(sampled: list[Episode]) -> None:
         nonlocal most, bytes_
-        end_s = time.monotonic() + (PAUSE_S if len(found) == 1 else 0.0)
+        end_s = time.monotonic() + (PAUSE_S if len(sampled) == 1 else 0.0)
         while time.monotonic() < end_s:
             pool.tick(0.05)
             most = max(most, len(ledger.leases) + ledger.arrived)
             bytes_ = max(bytes_, int(pool.status()["bytes_in_flight"]))
 
-    found = house.sample(pause)
+    sampled = house.sample(pause)
     assert most == 4
-    assert bytes_ == 4 * found[0].nbytes
-    house.check(found)
+    assert bytes_ == 4 * sampled[0].nbytes
+    house.check(sampled)
 
 
 def test_what_workers_sample_ahead_is_kept_once_and_the_rest_is_left_to_the_next_call(
@@ -293,7 +293,7 @@ def test_what_workers_sample_ahead_is_kept_once_and_the_rest_is_left_to_the_next
         house.executor.tend()
         return len(kept) >= 5
 
-    wait_until(tended, 30)
+    wait_until(tended, 120)
     ahead = [episode.episode_id for episode in kept]
     missing = [plan for plan in house.plans if plan.episode_id not in ahead]
     house.check(kept + house.sample_again(missing))
@@ -326,10 +326,10 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
 
         return holds
 
-    def check(found: list[Episode]) -> None:
-        if len(found) > 1:
+    def check(sampled: list[Episode]) -> None:
+        if len(sampled) > 1:
             return
-        wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 90)  # with the one not kept yet
+        wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 240)  # with the one not kept yet
         status = control.status(house.run)
         assert (status["state"], status["ready"], status["wanted"], status["backlog"]) == ("RUNNING", 2, 2, 30)
         pids = {(worker.id.slot, pid(worker)) for worker in house.workers}
@@ -338,7 +338,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
 
     house.sample(check)
     waits = "2 workers wait for plans"
-    wait_until(told(lambda found: waits in [wait["what"] for wait in found["waits"]]), 90)
+    wait_until(told(lambda status: waits in [wait["what"] for wait in status["waits"]]), 240)
 
 
 def test_the_configuration_of_these_tests_is_one_a_run_could_keep() -> None:

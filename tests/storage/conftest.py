@@ -2,11 +2,15 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+import resource
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
 
 import pyarrow as pa
 import pytest
+from run_digest import column_bytes
 
 from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
@@ -44,6 +48,45 @@ def commit(make_episode: Callable[..., Episode]) -> Commit:
 
 
 @pytest.fixture
+def commit_cut_off(commit: Commit, tmp_path: Path) -> Callable[[Run, int, str, str], list[Episode]]:
+    """commit_cut_off(run, iteration, committed, written) leaves what a crash within a commit leaves.
+
+    The tables `committed` have the iteration, the table `written` has its file alone, the others know nothing of it.
+    """
+
+    def cut_off(run: Run, iteration: int, committed: str, written: str = "") -> list[Episode]:
+        ahead = Run(tmp_path / "ahead")
+        shutil.copytree(run.path, ahead.path)
+        episodes = commit(ahead, iteration)
+        for table in committed.split():
+            shutil.copytree(ahead.tables / table, run.tables / table, dirs_exist_ok=True)
+        for table in written.split():
+            file = f"iteration-{iteration:06d}.parquet"
+            (run.tables / table).mkdir(exist_ok=True)
+            shutil.copy(ahead.tables / table / file, run.tables / table / file)
+        shutil.rmtree(ahead.path)
+        return episodes
+
+    return cut_off
+
+
+@pytest.fixture
+def full_disk() -> Callable[[], AbstractContextManager[None]]:
+    """Within `full_disk()` nothing can be written to a file, as where no space is left."""
+
+    @contextmanager
+    def full() -> Iterator[None]:
+        before, most = resource.getrlimit(resource.RLIMIT_FSIZE)
+        resource.setrlimit(resource.RLIMIT_FSIZE, (0, most))
+        try:
+            yield
+        finally:
+            resource.setrlimit(resource.RLIMIT_FSIZE, (before, most))
+
+    return full
+
+
+@pytest.fixture
 def rows() -> tuple[Callable[[int], dict[str, object]], Callable[[int], list[dict[str, object]]]]:
     """The makers of an iteration's row and of its classes' rows."""
     return iteration_row, class_rows
@@ -52,17 +95,4 @@ def rows() -> tuple[Callable[[int], dict[str, object]], Callable[[int], list[dic
 @pytest.fixture
 def bits() -> Callable[[pa.Table], list[list[bytes]]]:
     """A table's columns as raw bytes, so that -0.0 differs from 0.0."""
-
-    def raw(table: pa.Table) -> list[list[bytes]]:
-        columns = []
-        for column in table.columns:
-            leaf = column.combine_chunks()
-            valid = leaf.is_valid().to_pylist()
-            flat = leaf.flatten() if pa.types.is_list(leaf.type) else leaf.drop_null()
-            if pa.types.is_string(flat.type) or pa.types.is_boolean(flat.type):
-                columns.append([str(flat.to_pylist()).encode(), str(valid).encode()])
-            else:
-                columns.append([flat.to_numpy(zero_copy_only=False).tobytes(), str(valid).encode()])
-        return columns
-
-    return raw
+    return lambda table: [list(column_bytes(column)) for column in table.columns]

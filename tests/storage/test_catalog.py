@@ -2,6 +2,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -62,14 +63,9 @@ def test_a_root_that_the_tables_could_not_open_is_refused(tmp_path: Path) -> Non
         catalog.create(tmp_path / "100%25", "one", "{}")
 
 
-def test_a_creation_that_fails_midway_leaves_nothing_behind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
-    def full(*_: object, **__: object) -> None:
-        raise OSError(28, "No space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(Path, "write_text", full)
-        with pytest.raises(RunError, match="No space left"):
-            catalog.create(tmp_path, "one", "{}")
+def test_a_creation_that_fails_midway_leaves_nothing_behind(tmp_path: Path, full_disk: Any) -> None:
+    with full_disk(), pytest.raises(RunError, match=r"cannot create run 'one' .*File too large"):
+        catalog.create(tmp_path, "one", "{}")
     assert list(tmp_path.iterdir()) == []
     catalog.create(tmp_path, "one", "{}")
 

@@ -1,6 +1,9 @@
 from __future__ import annotations
 
 import logging
+import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from pathlib import Path
 
@@ -88,25 +91,31 @@ def test_only_damaged_checkpoints_are_an_error_that_names_each(tmp_path: Path) -
         checkpoint.load_latest(tmp_path)
 
 
-def test_a_save_that_was_cut_off_leaves_the_previous_one_and_can_be_repeated(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
-) -> None:
+KILLED = """
+import os, sys
+from pathlib import Path
+from t6gps.storage import checkpoint
+
+folder, name = sys.argv[1:]
+
+def die(event, arguments):
+    if event == "open" and str(arguments[0]).endswith(f".iteration-000001.partial/{name}"):
+        os.kill(os.getpid(), 9)
+
+sys.addaudithook(die)
+checkpoint.save(Path(folder), 1, {}, {})
+"""
+"""A save that is killed when it comes to a file of its checkpoint."""
+
+
+@pytest.mark.parametrize("name", ["arrays.npz", "manifest.json", "DONE"])
+def test_a_save_that_was_cut_off_leaves_the_previous_one_and_can_be_repeated(tmp_path: Path, name: str) -> None:
     checkpoint.save(tmp_path, 0, {}, ARRAYS)
-    for name in ("arrays.npz", "manifest.json", "DONE"):
-        real = Path.write_bytes
-
-        def stop(path: Path, content: bytes, name: str = name, real: Callable[..., int] = real) -> int:
-            if path.name == name:
-                raise KeyboardInterrupt
-            return real(path, content)
-
-        with monkeypatch.context() as patch:
-            patch.setattr(Path, "write_bytes", stop)
-            with pytest.raises(KeyboardInterrupt):
-                checkpoint.save(tmp_path, 1, {}, ARRAYS)
-        found = checkpoint.load_latest(tmp_path)
-        assert found is not None
-        assert found[0] == 0
+    killed = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path), name], check=False)
+    assert killed.returncode == -signal.SIGKILL
+    latest = checkpoint.load_latest(tmp_path)
+    assert latest is not None
+    assert latest[0] == 0
     checkpoint.save(tmp_path, 1, {}, ARRAYS)
     assert _names(tmp_path) == ["iteration-000000", "iteration-000001"]
 

@@ -1,6 +1,6 @@
 from __future__ import annotations
 
-from collections.abc import Iterable
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -9,12 +9,16 @@ import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.parquet as pq
 import pytest
-from deltalake import DeltaTable
+from deltalake import DeltaTable, write_deltalake
+from deltalake.transaction import CommitProperties, Transaction
 
-from t6gps.storage import catalog, parquet, schema, tables
+from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
+
+ORDER = ["frames", "classes", "iterations", "episodes"]
+"""In which tables are committed: an iteration is there when it stands in the last one."""
 
 
 def _snapshot(run: Run) -> dict[str, bytes]:
@@ -52,16 +56,15 @@ def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, rows: Any)
 
 
 def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_and_can_go_on(
-    run: Run, make_episode: Any, commit: Any, rows: Any, monkeypatch: pytest.MonkeyPatch
+    run: Run, commit: Any
 ) -> None:
     later = {"iterations": 4, "classes": 3}
-    with monkeypatch.context() as past:
-        first = {name: pa.schema(list(schema.TABLES[name])[:-n]) for name, n in later.items()}
-        past.setattr(schema, "TABLES", schema.TABLES | first)
-        make_row, make_classes = rows
-        row = {key: value for key, value in make_row(0).items() if key in first["iterations"].names}
-        classes = [{k: v for k, v in c.items() if k in first["classes"].names} for c in make_classes(0)]
-        tables.commit_iteration(run, 0, [make_episode(0, 0)], row, classes)
+    commit(run, 0)
+    for name, n in later.items():
+        rows = tables.read(run, name)
+        shutil.rmtree(run.tables / name)
+        committed = CommitProperties(app_transactions=[Transaction("t6gps", 0)])
+        write_deltalake(run.tables / name, rows.select(rows.column_names[:-n]), commit_properties=committed)
     commit(run, 1)
     for name, n in later.items():
         table = tables.read(run, name).sort_by("iteration")
@@ -106,28 +109,22 @@ def test_committing_twice_changes_nothing(run: Run, commit: Any) -> None:
     assert _snapshot(run) == before
 
 
-@pytest.mark.parametrize("committed", ["", "frames", "frames classes", "frames classes iterations"])
+def test_tables_are_committed_in_turn_and_episodes_last(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    commit(run, 1)
+    for version in (1, 2):  # version 0 is the empty table
+        logs = [run.tables / table / "_delta_log" / f"{version:020d}.json" for table in ORDER]
+        times = [log.stat().st_mtime_ns for log in logs]
+        assert times == sorted(times)
+
+
+@pytest.mark.parametrize("committed_n", range(4))
 @pytest.mark.parametrize("file_written", [False, True])
 def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by_committing_again(
-    run: Run, commit: Any, bits: Any, monkeypatch: pytest.MonkeyPatch, committed: str, file_written: bool
+    run: Run, commit: Any, commit_cut_off: Any, bits: Any, committed_n: int, file_written: bool
 ) -> None:
     whole = commit(run, 0)
-    done: list[str] = []
-    real = tables._commit
-
-    def crash(run: Run, table: str, iteration: int, groups: Iterable[pa.Table]) -> None:
-        if len(done) == len(committed.split()):
-            if file_written:
-                parquet.write(run.tables / table / f"iteration-{iteration:06d}.parquet", schema.TABLES[table], groups)
-            raise KeyboardInterrupt
-        real(run, table, iteration, groups)
-        done.append(table)
-
-    with monkeypatch.context() as patch:
-        patch.setattr(tables, "_commit", crash)
-        with pytest.raises(KeyboardInterrupt):
-            commit(run, 1)
-    assert done == committed.split()
+    commit_cut_off(run, 1, " ".join(ORDER[:committed_n]), ORDER[committed_n] if file_written else "")
     assert tables.committed_iterations(run) == 1
     assert bits(tables.read(run, "frames")) == bits(pa.concat_tables([each.frames for each in whole]))
     for table in schema.TABLES:
@@ -143,12 +140,9 @@ def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by
 
 
 def test_a_cut_off_commit_is_not_completed_with_other_episodes(
-    run: Run, commit: Any, make_episode: Any, rows: Any, monkeypatch: pytest.MonkeyPatch
+    run: Run, commit_cut_off: Any, make_episode: Any, rows: Any
 ) -> None:
-    real = tables._commit
-    with monkeypatch.context() as patch:
-        patch.setattr(tables, "_commit", lambda *given: given[1] == "frames" and real(*given))
-        commit(run, 0)
+    commit_cut_off(run, 0, "frames")
     with pytest.raises(DataError, match="holds other episodes"):
         tables.commit_iteration(run, 0, [make_episode(9, 0)], rows[0](0), rows[1](0))
     assert tables.committed_iterations(run) == 0

@@ -4,13 +4,14 @@ import os
 import signal
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 import pytest
 import ray
-from house import others, three_nodes
+from house import joining, others, three_nodes
 from ray.cluster_utils import Cluster
+from run_digest import digests
+from tiny_run import TINY, Trained, Watcher
 
 from t6gps.learner import policy as torch_policy
 from t6gps.service.config import Config, load
@@ -18,33 +19,18 @@ from t6gps.service.execution.executor import Executor
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.service.training import loop
-from t6gps.storage import catalog, checkpoint, tables
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.workers.episode import policy
 
-TINY = [
-    "run.iterations=2",
-    "run.episodes=5",
-    "run.steps=40",
-    "learner.smallest_class_segments=4",
-    "learner.epochs=2",
-    "learner.replay_iterations=1",
-    "learner.hidden_layers=[16]",
-]
-
-PIPELINED = [*TINY, "run.iterations=3", "run.pipelined=true"]
+PIPELINED = [*TINY, "run.pipelined=true"]
 
 
-class Silent:
-    def progress(self, iteration: int, phase: str, done: int, total: int) -> None: ...
-
-    def finished(self, row: dict[str, Any]) -> None: ...
-
-
-class Kills(Silent):
+class Kills(Watcher):
     """Kills a worker at some progress of the run, and the learner while it fits the second iteration."""
 
     def __init__(self, executor: RayExecutor, worker_at: tuple[int, str, int]) -> None:
+        super().__init__()
         self.executor, self.worker_at, self.done = executor, worker_at, set[str]()
 
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
@@ -57,7 +43,7 @@ class Kills(Silent):
             self.executor.learner.kill()
 
 
-class Stops(Silent):
+class Stops(Watcher):
     """Stops the run while the learner is at work on the second iteration."""
 
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
@@ -65,10 +51,11 @@ class Stops(Silent):
             raise KeyboardInterrupt
 
 
-class Loses(Silent):
+class Loses(Watcher):
     """Loses a node that has a worker in the second iteration's sampling."""
 
     def __init__(self, executor: RayExecutor, nodes: Cluster) -> None:
+        super().__init__()
         self.executor, self.nodes, self.lost = executor, nodes, ""
 
     def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
@@ -86,38 +73,35 @@ def no_ray_left_behind() -> Iterator[None]:
     assert not ray.is_initialized()
 
 
-def result_of(
-    config: Config, executor: Executor, root: Path, observer: loop.Observer | None = None
-) -> tuple[Any, Any, list[bytes]]:
-    this = catalog.create(root, f"run-{type(executor).__name__}-{config.run.workers}", config.to_json())
-    return completed(config, executor, this, observer or Silent())
+def result_of(config: Config, executor: Executor, root: Path, observer: loop.Observer | None = None) -> dict[str, str]:
+    """Digests of a new run."""
+    return completed(config, executor, catalog.create(root, "run", config.to_json()), observer or Watcher())
 
 
-def completed(config: Config, executor: Executor, this: Run, observer: loop.Observer) -> tuple[Any, Any, list[bytes]]:
+def completed(config: Config, executor: Executor, run: Run, observer: loop.Observer) -> dict[str, str]:
+    """Digests of a run, once it has what it is missing."""
     try:
-        loop.train(config, this, executor, observer)
+        loop.train(config, run, executor, observer)
     finally:
         executor.close()
-    latest = checkpoint.load_latest(this.checkpoints)
-    assert latest is not None
-    weights = [latest[2][name].tobytes() for name in sorted(latest[2])]
-    return tables.read(this, "frames"), tables.read(this, "episodes"), weights
+    return digests(run.path)
 
 
 @pytest.fixture(scope="module")
-def serial(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[bytes]]:
-    config = load("flat-quick", TINY)
-    return result_of(config, SerialExecutor(config), tmp_path_factory.mktemp("serial"))
+def serial(tiny: Trained) -> dict[str, str]:
+    """Digests of the serial run of TINY, without its evaluation."""
+    return {part: digest for part, digest in tiny.digests.items() if part != "evaluation"}
 
 
 @pytest.mark.slow
-def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, serial: Any) -> None:
+@pytest.mark.ray
+def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, serial: dict[str, str]) -> None:
     config = load("flat-quick", [*TINY, "run.workers=1"])
     assert result_of(config, RayExecutor(config), tmp_path) == serial
 
 
 @pytest.fixture(scope="module")
-def pipelined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[bytes]]:
+def pipelined(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     config = load("flat-quick", PIPELINED)
     return result_of(config, SerialExecutor(config), tmp_path_factory.mktemp("pipelined"))
 
@@ -129,6 +113,7 @@ def pipelined(tmp_path_factory: pytest.TempPathFactory) -> tuple[Any, Any, list[
     ids=["ordinary", "sampling-ahead"],
 )
 def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
+    ray_head: dict[str, str],
     tmp_path: Path,
     request: pytest.FixtureRequest,
     settings: list[str],
@@ -136,7 +121,8 @@ def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
     worker_at: tuple[int, str, int],
 ) -> None:
     config = load("flat-quick", [*settings, "run.workers=2"])
-    executor = RayExecutor(config)
+    with joining(ray_head):
+        executor = RayExecutor(config)
     kills = Kills(executor, worker_at)
     assert result_of(config, executor, tmp_path, kills) == request.getfixturevalue(expected)
     assert kills.done == {"worker", "learner"}
@@ -145,17 +131,19 @@ def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
 
 @pytest.mark.slow
 def test_t10_t15_a_run_that_is_stopped_while_it_samples_ahead_goes_on_with_the_same_bytes(
-    tmp_path: Path, pipelined: Any
+    ray_head: dict[str, str], tmp_path: Path, pipelined: dict[str, str]
 ) -> None:
     config = load("flat-quick", [*PIPELINED, "run.workers=2"])
-    this = catalog.create(tmp_path, "stopped", config.to_json())
-    with pytest.raises(KeyboardInterrupt):
-        completed(config, RayExecutor(config), this, Stops())
-    assert completed(config, RayExecutor(config), this, Silent()) == pipelined
+    run = catalog.create(tmp_path, "stopped", config.to_json())
+    with joining(ray_head):
+        with pytest.raises(KeyboardInterrupt):
+            completed(config, RayExecutor(config), run, Stops())
+        assert completed(config, RayExecutor(config), run, Watcher()) == pipelined
 
 
 @pytest.mark.slow
-def test_t15_t16_three_nodes_of_which_one_dies_change_no_byte(tmp_path: Path, serial: Any) -> None:
+@pytest.mark.ray
+def test_t15_t16_three_nodes_of_which_one_dies_change_no_byte(tmp_path: Path, serial: dict[str, str]) -> None:
     config = load("flat-quick", [*TINY, "run.workers=3"])
     with three_nodes() as nodes:
         executor = RayExecutor(config)

@@ -41,7 +41,7 @@ def test_a_run_whose_cluster_is_not_there_leaves_nothing_behind(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("RAY_ADDRESS", "head")
-    this = catalog.create(tmp_path, "one", Config().to_json())
+    run = catalog.create(tmp_path, "one", Config().to_json())
     with pytest.raises(RunError, match="RAY_ADDRESS"):
-        session.complete(Config(), this, False, ProgressDisplay(1))
+        session.complete(Config(), run, False, ProgressDisplay(1))
     assert list(tmp_path.iterdir()) == []

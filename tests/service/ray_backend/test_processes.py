@@ -60,32 +60,32 @@ def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behi
 ) -> None:
     command = [*TRAIN, "--root", str(tmp_path)]
     started = subprocess.Popen(command, stderr=subprocess.PIPE, start_new_session=True)
-    this = catalog.Run(tmp_path / "watched")
+    run = catalog.Run(tmp_path / "watched")
 
     def spooled() -> int:
         assert started.poll() is None
         return len(list(tmp_path.glob("watched/spool/*/episode-*.arrow")))
 
     try:
-        wait_until(lambda: spooled() >= 2, 120)
+        wait_until(lambda: spooled() >= 2, 240)
         family = descendants(started.pid)
         assert listeners(family)
         assert listeners(family) <= set(LOOPBACK)
-        os.kill(control.status(this)["workers"][0]["pid"], signal.SIGKILL)
+        os.kill(control.status(run)["workers"][0]["pid"], signal.SIGKILL)
         before = spooled()
-        wait_until(lambda: spooled() >= before + 5, 60)
-        assert control.status(this)["processes"]["crashed"] == 1
+        wait_until(lambda: spooled() >= before + 5, 240)
+        assert control.status(run)["processes"]["crashed"] == 1
         family = descendants(started.pid)
         for _ in range(2):  # the second stop does nothing
             started.send_signal(signal.SIGTERM)
-        _, message = started.communicate(timeout=30)
+        _, message = started.communicate(timeout=120)
     finally:
         started.kill()
     assert started.returncode == 130, message
     assert b"--resume" in message
     assert b"Traceback" not in message
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 10)
-    assert control.status(this)["state"] == "STOPPED"
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 60)
+    assert control.status(run)["state"] == "STOPPED"
     with pytest.raises(RunError, match=r"not running \(STOPPED.*--resume"):
-        control.scale(this, 2)
-    assert not (this.pool / "scale_request.json").exists()
+        control.scale(run, 2)
+    assert not (run.pool / "scale_request.json").exists()

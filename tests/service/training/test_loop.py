@@ -1,4 +1,4 @@
-"""Laws of the training loop: a run that was stopped anywhere goes on as if it had not been."""
+"""Laws of the training loop: a run that was stopped anywhere resumes as if it had not been."""
 
 from collections.abc import Iterator, Sequence
 from pathlib import Path
@@ -6,8 +6,9 @@ from typing import Any
 
 import numpy as np
 import pytest
+from run_digest import digests
+from tiny_run import TINY, Trained, Watcher
 
-from t6gps.learner.improvers import action_value as value
 from t6gps.learner.phases import PHASES, Phase
 from t6gps.service.config import Config, load
 from t6gps.service.execution.executor import Keep, Purpose
@@ -17,33 +18,7 @@ from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 
-TINY = [
-    "run.iterations=3",
-    "run.episodes=3",
-    "run.steps=30",
-    "learner.smallest_class_segments=4",
-    "learner.epochs=2",
-    "learner.replay_iterations=1",
-    "learner.hidden_layers=[16]",
-]
-
-
 PHASES_BY_NAME = {phase.name: phase for phase in PHASES}
-
-
-class Silent:
-    """Counts what it is told."""
-
-    def __init__(self) -> None:
-        self.rows: list[dict[str, Any]] = []
-        self.phases: set[str] = set()
-
-    def progress(self, iteration: int, phase: str, done: int, total: int) -> None:
-        assert 0 <= done <= total
-        self.phases.add(phase)
-
-    def finished(self, row: dict[str, Any]) -> None:
-        self.rows.append(row)
 
 
 class StopsAfter(SerialExecutor):
@@ -80,87 +55,64 @@ class SamplesAhead(StopsAfter):
         self.sample(plans[:2], snapshot, keep)
 
 
-def trained(config: Config, this: Run, executor: SerialExecutor) -> Silent:
-    observer = Silent()
+def trained(config: Config, run: Run, executor: SerialExecutor) -> Watcher:
+    watcher = Watcher()
     try:
-        loop.train(config, this, executor, observer)
+        loop.train(config, run, executor, watcher)
     finally:
         executor.close()
-    return observer
-
-
-def kept(this: Run) -> tuple[Any, Any, list[bytes]]:
-    """Everything of a run that must not depend on interruptions."""
-    latest = checkpoint.load_latest(this.checkpoints)
-    assert latest is not None
-    weights = [latest[2][name].tobytes() for name in sorted(latest[2])]
-    order = [("episode_id", "ascending"), ("step", "ascending")]
-    return tables.read(this, "frames").sort_by(order), tables.read(this, "episodes").sort_by("episode_id"), weights
+    return watcher
 
 
 @pytest.fixture(scope="module")
-def config() -> Config:
-    return load("flat-quick", TINY)
+def config(tiny: Trained) -> Config:
+    return tiny.config
 
 
 @pytest.fixture(scope="module")
-def uninterrupted(config: Config, tmp_path_factory: pytest.TempPathFactory) -> Run:
-    this = catalog.create(tmp_path_factory.mktemp("runs"), "whole", config.to_json())
-    observer = trained(config, this, SerialExecutor(config))
-    assert [row["iteration"] for row in observer.rows] == [0, 1, 2]
-    assert observer.phases == {"sample", *PHASES_BY_NAME}
-    return this
+def whole(tiny: Trained) -> dict[str, str]:
+    """Digests of an uninterrupted run, without its evaluation."""
+    return {part: digest for part, digest in tiny.digests.items() if part != "evaluation"}
 
 
 @pytest.mark.parametrize("stop", [{"episodes": 0}, {"episodes": 4}, *({"phase": phase} for phase in PHASES_BY_NAME)])
 def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
-    config: Config, uninterrupted: Run, tmp_path: Path, stop: dict[str, Any]
+    config: Config, whole: dict[str, str], tmp_path: Path, stop: dict[str, Any]
 ) -> None:
-    this = catalog.create(tmp_path, "stopped", config.to_json())
+    run = catalog.create(tmp_path, "stopped", config.to_json())
     with pytest.raises(KeyboardInterrupt):
-        trained(config, this, StopsAfter(config, **stop))
-    trained(config, this, SerialExecutor(config))
-    for found, expected in zip(kept(this), kept(uninterrupted), strict=True):
-        assert found == expected
+        trained(config, run, StopsAfter(config, **stop))
+    watcher = trained(config, run, SerialExecutor(config))
+    assert digests(run.path) == whole
+    assert watcher.phases == {"sample", *PHASES_BY_NAME}
+    assert [row["iteration"] for row in watcher.rows] == [0, 1, 2][-len(watcher.rows) :]
 
 
-@pytest.mark.parametrize("stop", [{"episodes": 7}, {"phase": "backward_pass"}])
-def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(
-    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, stop: dict[str, Any]
-) -> None:
-    for name in ("STEPS", "FIRST_STEPS"):
-        monkeypatch.setattr(value, name, value.PREPARED_N)
+def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(tmp_path: Path) -> None:
     config = load("flat-quick", [*TINY, "learner.value_from=1"])
     whole, stopped = (catalog.create(tmp_path, name, config.to_json()) for name in ("whole", "stopped"))
     trained(config, whole, SerialExecutor(config))
-    with pytest.raises(KeyboardInterrupt):
-        trained(config, stopped, StopsAfter(config, **stop))
+    for stop in (StopsAfter(config, phase="backward_pass"), StopsAfter(config, episodes=1)):  # iterations 1 and 2
+        with pytest.raises(KeyboardInterrupt):
+            trained(config, stopped, stop)
+    assert tables.committed_iterations(stopped) == 2
     trained(config, stopped, SerialExecutor(config))
-    for found, expected in zip(kept(stopped), kept(whole), strict=True):
-        assert found == expected
+    assert digests(stopped.path) == digests(whole.path)
 
 
-@pytest.mark.parametrize("step", ["tables.commit_iteration", "checkpoint.save"])
 def test_a_crash_between_commit_and_checkpoint_changes_nothing(
-    config: Config, uninterrupted: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, step: str
+    config: Config, whole: dict[str, str], tmp_path: Path
 ) -> None:
-    this = catalog.create(tmp_path, "crashed", config.to_json())
-    module, name = step.split(".")
-    whole = getattr(getattr(loop, module), name)
-
-    def crashing(*arguments: Any) -> None:
-        if name == "commit_iteration":
-            whole(*arguments)
-        raise OSError("no space left on device")
-
-    with monkeypatch.context() as patch:
-        patch.setattr(getattr(loop, module), name, crashing)
-        with pytest.raises(OSError, match="no space"):
-            trained(config, this, SerialExecutor(config))
-    trained(config, this, SerialExecutor(config))
-    for found, expected in zip(kept(this), kept(uninterrupted), strict=True):
-        assert found == expected
-    assert tables.read(this, "iterations")["iteration"].to_pylist() == [0, 1, 2]
+    run = catalog.create(tmp_path, "crashed", config.to_json())
+    obstacle = run.checkpoints / ".iteration-000001.partial"
+    obstacle.touch()  # where the first checkpoint's folder is to be
+    with pytest.raises(OSError, match=obstacle.name):
+        trained(config, run, SerialExecutor(config))
+    assert tables.committed_iterations(run) == 1
+    assert checkpoint.load_latest(run.checkpoints) is None
+    obstacle.unlink()
+    trained(config, run, SerialExecutor(config))
+    assert digests(run.path) == whole
 
 
 @pytest.fixture(scope="module")
@@ -171,9 +123,9 @@ def pipelined() -> Config:
 @pytest.fixture(scope="module")
 def in_turn(pipelined: Config, tmp_path_factory: pytest.TempPathFactory) -> Run:
     """A pipelined run in which nothing is sampled ahead."""
-    this = catalog.create(tmp_path_factory.mktemp("runs"), "in-turn", pipelined.to_json())
-    trained(pipelined, this, SerialExecutor(pipelined))
-    return this
+    run = catalog.create(tmp_path_factory.mktemp("runs"), "in-turn", pipelined.to_json())
+    trained(pipelined, run, SerialExecutor(pipelined))
+    return run
 
 
 def test_a_pipelined_run_holds_the_version_that_acted_in_every_row(in_turn: Run) -> None:
@@ -189,25 +141,23 @@ def test_a_pipelined_run_holds_the_version_that_acted_in_every_row(in_turn: Run)
 def test_a_pipelined_run_resumes_bit_for_bit_and_samples_nothing_twice(
     pipelined: Config, in_turn: Run, tmp_path: Path, stop: dict[str, Any], left: int
 ) -> None:
-    this = catalog.create(tmp_path, "stopped", pipelined.to_json())
+    run = catalog.create(tmp_path, "stopped", pipelined.to_json())
     with pytest.raises(KeyboardInterrupt):
-        trained(pipelined, this, SamplesAhead(pipelined, **stop))
-    trained(pipelined, this, SamplesAhead(pipelined, episodes=left))
-    for found, expected in zip(kept(this), kept(in_turn), strict=True):
-        assert found == expected
+        trained(pipelined, run, SamplesAhead(pipelined, **stop))
+    trained(pipelined, run, SamplesAhead(pipelined, episodes=left))
+    assert digests(run.path) == digests(in_turn.path)
 
 
 def test_spooled_episodes_are_not_sampled_again(config: Config, tmp_path: Path) -> None:
-    this = catalog.create(tmp_path, "stopped", config.to_json())
+    run = catalog.create(tmp_path, "stopped", config.to_json())
     with pytest.raises(KeyboardInterrupt):
-        trained(config, this, StopsAfter(config, episodes=2))
-    counter = StopsAfter(config, episodes=config.run.iterations * config.run.episodes - 2)
-    trained(config, this, counter)
+        trained(config, run, StopsAfter(config, episodes=2))
+    trained(config, run, StopsAfter(config, episodes=config.run.iterations * config.run.episodes - 2))
 
 
-def test_the_iterations_table_summarises_its_episodes(uninterrupted: Run) -> None:
-    episodes = tables.read(uninterrupted, "episodes")
-    for row in tables.read(uninterrupted, "iterations").to_pylist():
+def test_the_iterations_table_summarises_its_episodes(tiny: Trained) -> None:
+    episodes = tables.read(tiny.run, "episodes")
+    for row in tables.read(tiny.run, "iterations").to_pylist():
         cost = np.array([e["cost"] for e in episodes.to_pylist() if e["iteration"] == row["iteration"]])
         assert row["cost"] == pytest.approx(cost.mean())
         assert row["cost_standard_error"] == pytest.approx(cost.std(ddof=1) / np.sqrt(len(cost)))
@@ -215,16 +165,17 @@ def test_the_iterations_table_summarises_its_episodes(uninterrupted: Run) -> Non
         assert row["policy_version"] == row["iteration"]
 
 
-def test_an_evaluation_is_noise_free_repeatable_and_kept(config: Config, uninterrupted: Run) -> None:
+def test_an_evaluation_is_noise_free_repeatable_and_kept(tiny: Trained, tmp_path: Path) -> None:
+    latest = checkpoint.load_latest(tiny.run.checkpoints)
+    assert latest is not None
     results = []
     for _ in range(2):
-        executor = SerialExecutor(config)
-        latest = checkpoint.load_latest(uninterrupted.checkpoints)
-        assert latest is not None
+        executor = SerialExecutor(tiny.config)
         executor.learner.restore(*latest[1:])
-        results.append(evaluation.evaluate(config, executor, 3, seed=1, terrain_seed=None, observer=Silent()))
+        results.append(evaluation.evaluate(tiny.config, executor, 3, seed=1, terrain_seed=None, observer=Watcher()))
         executor.close()
     assert results[0] == results[1]
-    assert evaluation.kept(uninterrupted) is None
-    evaluation.keep(uninterrupted, results[0])
-    assert evaluation.kept(uninterrupted) == results[0]
+    run = catalog.create(tmp_path, "evaluated", tiny.config.to_json())
+    assert evaluation.kept(run) is None
+    evaluation.keep(run, results[0])
+    assert evaluation.kept(run) == results[0]

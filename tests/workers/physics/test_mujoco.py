@@ -14,6 +14,8 @@ from pathlib import Path
 import mujoco
 import numpy as np
 import pytest
+from command import t6gps
+from tiny_run import Trained
 
 from t6gps.storage.errors import PhysicsError
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
@@ -306,35 +308,23 @@ def test_the_benchmark_compares_motions_that_agree() -> None:
 # Command line
 
 
-def _t6gps(*arguments: str | Path, code: int = 0) -> subprocess.CompletedProcess[str]:
-    command = [sys.executable, "-m", "t6gps", *map(str, arguments)]
-    done = subprocess.run(command, capture_output=True, text=True, check=False, timeout=300)
-    assert done.returncode == code, done.stderr + done.stdout
-    return done
-
-
 def test_export_writes_the_chosen_robot_and_ground(tmp_path: Path) -> None:
     path = tmp_path / "robot.xml"
-    _t6gps("export", "mjcf", path, "--set", "robot.bar_mass_kg=5.0", "--set", "terrain.difficulty=0.5")
+    t6gps("export", "mjcf", path, "--set", "robot.bar_mass_kg=5.0", "--set", "terrain.difficulty=0.5")
     model = mujoco.MjModel.from_xml_path(str(path))
     assert model.body_mass.sum() == pytest.approx(30.0)
     assert model.nhfield == 1
     assert (
         "allowed: keys that start with robot., terrain."
-        in _t6gps("export", "mjcf", path, "--set", "run.seed=3", code=2).stderr
+        in t6gps("export", "mjcf", path, "--set", "run.seed=3", code=2).stderr
     )
-    assert "cannot write" in _t6gps("export", "mjcf", tmp_path / "absent" / "robot.xml", code=2).stderr
+    assert "cannot write" in t6gps("export", "mjcf", tmp_path / "absent" / "robot.xml", code=2).stderr
 
 
-@pytest.mark.slow
-def test_eval_runs_on_the_second_engine(tmp_path: Path) -> None:
-    tiny = ["run.iterations=1", "run.episodes=3", "run.steps=30", "run.evaluation_episodes=2"]
-    tiny += ["learner.smallest_class_segments=4", "learner.epochs=2", "learner.hidden_layers=[16]"]
-    settings = [f"--set={item}" for item in tiny]
-    _t6gps("train", "flat-quick", "--run", "tiny", "--serial", "--root", tmp_path, *settings)
-    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", tmp_path)
-    bullet = json.loads(_t6gps(*arguments).stdout)
-    second = json.loads(_t6gps(*arguments, "--engine", "mujoco").stdout)
+def test_eval_runs_on_the_second_engine(tiny: Trained) -> None:
+    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", tiny.run.path.parent)
+    bullet = json.loads(t6gps(*arguments).stdout)
+    second = json.loads(t6gps(*arguments, "--engine", "mujoco").stdout)
     assert bullet.keys() == second.keys()
     assert bullet["cost"] != second["cost"]
     assert bullet["cost"]["mean"] == pytest.approx(second["cost"]["mean"], abs=0.2)
