@@ -66,7 +66,7 @@ class Config(RolloutSettings):
         return RolloutSettings(**{name: getattr(self, name) for name in RolloutSettings.model_fields})
 
     def to_json(self) -> str:
-        """The configuration as the run keeps it; options that are none are left out."""
+        """The configuration as the run keeps it; options that are none do not stand in it."""
         return self.model_dump_json(indent=2, exclude_none=True) + "\n"
 
 

@@ -5,7 +5,7 @@ ROOT/NAME/tables/         frames, episodes, iterations, classes: Delta tables
 ROOT/NAME/spool/          episodes of the iteration being sampled
 ROOT/NAME/checkpoints/    states of the learner
 ROOT/NAME/figures/        pictures drawn from the tables
-ROOT/NAME/pool/           wish and status of the workers of a run that goes on
+ROOT/NAME/pool/           scale request, status and decisions of a running run
 ROOT/NAME/bundles/        episodes that failed, with what is needed to run them alone
 """
 
@@ -155,7 +155,7 @@ def locked(run: Run) -> Iterator[None]:
         yield
 
 
-def holder(run: Run) -> int | None:
+def process_of(run: Run) -> int | None:
     """The process that has the run locked, None when there is none."""
     with (run.path / ".lock").open("a+") as file:
         try:

@@ -14,7 +14,7 @@ class RunError(T6GpsError):
 
 
 class LearnerDiedError(RunError):
-    """The learner's process ended; another one can go on from the newest checkpoint and the spool."""
+    """The learner's process ended; another one can resume from the newest checkpoint and the spool."""
 
 
 class DataError(T6GpsError):

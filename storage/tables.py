@@ -108,8 +108,8 @@ def read(run: Run, table: str, columns: list[str] | None = None, filter: pc.Expr
         raise DataError(f"table {table} has no column {unknown[0]!r}; columns: {', '.join(whole.names)}")
     wanted = pa.schema([whole.field(name) for name in names], whole.metadata)
     iterations_n = committed_iterations(run)
-    found = _files(run.tables / table) if iterations_n else []
-    return parquet.rows(table, found, iterations_n).to_table(names, filter=filter).cast(wanted)
+    paths = _files(run.tables / table) if iterations_n else []
+    return parquet.rows(table, paths, iterations_n).to_table(names, filter=filter).cast(wanted)
 
 
 def episode_frames(run: Run, episode_id: int) -> pa.Table:

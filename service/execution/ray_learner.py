@@ -92,7 +92,7 @@ class RayLearner:
     def add(self, reference: Reference) -> None:
         """Send an episode by its reference in the object store; waits while too many are on their way.
 
-        How it went is asked by `learn`: sampling goes on when the learner has died.
+        How it went is asked by `learn`: sampling continues when the learner has died.
         """
         self._taken.append(self.actor.add.remote(reference))
         if len(self._taken) > EPISODES_UNDER_WAY_N:
@@ -163,7 +163,7 @@ def _get(reference: Reference) -> Any:
         raise
     except ray.exceptions.RayError as error:
         raise RunError(
-            f"a process of the run died ({type(error).__name__}); everything sampled so far is kept: go on with "
+            f"a process of the run died ({type(error).__name__}); everything sampled so far is kept: resume with "
             "--resume, and with fewer --workers if memory ran out"
         ) from error
 

@@ -74,7 +74,7 @@ def attempt(worker: Runner, plan: EpisodePlan, snapshot: PolicySnapshot) -> Epis
         episode = checked(worker.run(plan, snapshot), plan.iteration)
         if (found := episode.summary["episode_id"][0].as_py()) != plan.episode_id:
             raise DataError(f"episode {plan.episode_id} was asked for, the worker gave episode {found}")
-    except Exception as error:  # whatever a simulator raises, the run goes on
+    except Exception as error:  # whatever a simulator raises, the run continues
         step, states = worker.position()
         trace = "".join(traceback.format_exception(error))
         return Failure(FailureKind.RAISED, type(error).__name__, str(error), plan.seed, step, trace, states)

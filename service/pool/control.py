@@ -170,8 +170,8 @@ def status(run: Run) -> Status:
         ) from None
     if newest["state"] in ENDED:
         return newest
-    if catalog.holder(run) != newest["pid"]:
-        reason = "its process has ended; go on with --resume"
+    if catalog.process_of(run) != newest["pid"]:
+        reason = "its process has ended; resume with --resume"
         return {**newest, "state": RunState.STOPPED, "reason": reason, "workers": []}
     age_s = time.time() - newest["time_s"]
     for entry in (*newest["workers"], *newest["waits"]):
@@ -188,7 +188,7 @@ def scale(run: Run, workers: int, deadline_s: float = SCALE_DEADLINE_S) -> Statu
     before = status(run)
     if before["state"] in (RunState.STOPPED, RunState.STOPPING, *ENDED):
         reason = f": {before['reason']}" if before["reason"] else ""
-        raise RunError(f"run {run.name} is not running ({before['state']}{reason}); go on with t6gps train --resume")
+        raise RunError(f"run {run.name} is not running ({before['state']}{reason}); resume with t6gps train --resume")
     if not 0 <= workers <= before["most"]:
         raise RunError(f"workers must lie in 0 .. {before['most']} for run {run.name}, found {workers}")
     request = _ask(run, workers)

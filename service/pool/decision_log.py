@@ -4,8 +4,8 @@ RUN/pool/decisions.jsonl     {"state"}: the supervisor's state when the file beg
                              {"now", "observed", "decided"}: a round, times in seconds of a clock of its own
 
 A file that has grown large is renamed to `decisions.1.jsonl`, and a new one begins with the state of that moment. The
-same happens when the run is resumed. Rounds in which nothing was observed or decided are left out where they cannot
-change the state.
+same happens when the run is resumed. Rounds in which nothing was observed or decided are not written where they
+cannot change the state.
 """
 
 from __future__ import annotations

@@ -160,11 +160,11 @@ class Ledger:
         return sum(failure.kind is FailureKind.HANG for failure in self.failures.get(plan.episode_id, ()))
 
     def state(self) -> dict[str, Any]:
-        """What a resumed run goes on with: the counters. Which episodes are missing stands in spool and bundles."""
+        """What a resumed run needs: the counters. Which episodes are missing stands in spool and bundles."""
         return {"counters": dict(self.counters)}
 
     def restore(self, state: Any) -> None:
-        """Go on from `state()`; nothing changes for a checkpoint that has none."""
+        """Continue from `state()`; nothing changes for a checkpoint that has none."""
         if state is None:
             return
         self.counters |= {name: int(state["counters"].get(name, 0)) for name in COUNTERS}

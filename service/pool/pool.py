@@ -67,7 +67,7 @@ class Pool:
     def tick(self, wait_s: float = 0.0) -> None:
         """One round: observe, decide, carry out. Waits up to `wait_s` for news, which are for the next round.
 
-        RunError when the run cannot go on (`supervisor.decide`).
+        RunError when the run cannot continue (`supervisor.decide`).
         """
         self._listen(0.0)
         self.ticked_s = self._clock()

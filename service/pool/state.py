@@ -135,7 +135,7 @@ class Worker:
     ending: tuple[Ending, str, str] | None = None
 
     def enter(self, phase: WorkerPhase) -> None:
-        """Go on to another phase; the same is no change."""
+        """Come to another phase; the same is no change."""
         if phase is not self.phase:
             assert phase in NEXT_PHASES[self.phase], f"worker {self.id} cannot go from {self.phase} to {phase}"
             self.phase = phase

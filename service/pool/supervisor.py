@@ -47,8 +47,8 @@ BREAKER_N = 5
 def decide(state: PoolState, observed: Sequence[Observation], now: float) -> list[Instruction]:
     """Bring what is towards what is asked for: change `state` by what was observed, and say what to do.
 
-    The state's condition is FAILED when the run cannot go on: the breaker is open, nothing but failures comes back, or
-    a worker has other settings or another policy than the run.
+    The state's condition is FAILED when the run cannot continue: the breaker is open, nothing but failures comes back,
+    or a worker has other settings or another policy than the run.
     """
     instructions = [instruction for observation in observed for instruction in _observe(state, observation, now)]
     instructions += scaling.ask_capacity(state, now)
@@ -140,7 +140,7 @@ def _acted_as_planned(state: PoolState, worker: Worker, plan: EpisodePlan, polic
     _fail(
         state,
         f"worker {worker.id} acted with another policy than version {plan.policy_version} of the run; "
-        "its data are not kept: go on with --resume, and report this",
+        "its data are not kept: resume with --resume, and report this",
     )
     return False
 
@@ -265,10 +265,10 @@ def _update_condition(state: PoolState) -> None:
         _fail(
             state,
             f"{state.failed_starts_n} workers in a row could not start; the last: {state.last_trouble}; "
-            "mend the cause, then go on with --resume",
+            "mend the cause, then resume with --resume",
         )
     elif state.wanted == 0:
-        state.turn(RunState.PAUSED, "scaled to no workers; scale up to go on")
+        state.turn(RunState.PAUSED, "scaled to no workers; scale up to continue")
     elif ready_n >= state.wanted:
         state.turn(RunState.RUNNING, "")
     elif pending_n:

@@ -50,13 +50,13 @@ def stacks(process: Process) -> str:
     file = Path(f"/proc/{process.pid}/fd/{process.stacks}")
     try:
         os.kill(process.pid, signal.SIGUSR1)
-        deadline, found, before = time.monotonic() + STACKS_S, b"", None
-        while time.monotonic() < deadline and (not found or found != before):
+        deadline, text, before = time.monotonic() + STACKS_S, b"", None
+        while time.monotonic() < deadline and (not text or text != before):
             time.sleep(0.01)
-            before, found = found, file.read_bytes()
+            before, text = text, file.read_bytes()
     except OSError as error:
         return f"its stacks could not be read: {error}"
-    return found.decode(errors="replace") or f"no stacks within {STACKS_S} s; process state {state}"
+    return text.decode(errors="replace") or f"no stacks within {STACKS_S} s; process state {state}"
 
 
 def kill(process: Process) -> None:
@@ -81,10 +81,10 @@ def descendants(pid: int) -> list[int]:
     for path in Path("/proc").glob("[0-9]*"):
         with suppress(FileNotFoundError, ProcessLookupError):  # it has ended meanwhile
             parents[int(path.name)] = int(_fields(int(path.name))[1])
-    found = [pid]
-    for parent in found:  # it grows
-        found += [child for child, whose in parents.items() if whose == parent]
-    return found[1:]
+    family = [pid]
+    for parent in family:  # it grows
+        family += [child for child, whose in parents.items() if whose == parent]
+    return family[1:]
 
 
 def command(pid: int) -> str:

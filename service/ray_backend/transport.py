@@ -154,8 +154,8 @@ class RayTransport(Transport):
     def _examine_there(self, process: Process, node: str, died: bool) -> PostMortem:
         if node in self._agents:
             try:
-                asked = self._agents[node].examine.remote(process, died)
-                post_mortem: PostMortem = ray.get(asked, timeout=self._timings.examine_s)
+                examined = self._agents[node].examine.remote(process, died)
+                post_mortem: PostMortem = ray.get(examined, timeout=self._timings.examine_s)
                 return post_mortem
             except ray.exceptions.ActorDiedError:
                 del self._agents[node]  # the next worker that is ready there brings another

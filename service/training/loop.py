@@ -1,12 +1,12 @@
 """The training loop: sample, keep, learn, commit, checkpoint (paper Alg. 2, once per iteration).
 
-What a crash leaves behind decides where to go on. Episodes are in the spool as soon as they are acknowledged; an
+What a crash leaves behind decides where a run resumes. Episodes are in the spool as soon as they are acknowledged; an
 iteration's tables are committed once; the checkpoint comes last and the spool is emptied after it. So a resumed run
 takes the newest checkpoint, reads the spooled episodes of its iteration, samples the missing ones and learns again:
 each step depends on seeds alone, and committing an iteration a second time changes nothing.
 
 In a pipelined run the workers begin with an iteration while the learner is still at work on the one before it. What
-they have sampled is in the spool when the iteration's turn comes, which then goes on as a resumed one does.
+they have sampled is in the spool when the iteration's turn comes, which then resumes.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ class Observer(Protocol):
 def train(config: Config, run: Run, executor: Executor, observer: Observer) -> None:
     """Run the iterations that are missing, from the newest checkpoint on.
 
-    A learner that dies is replaced by one that goes on from there, too; LearnerDiedError when that does not help.
+    A learner that dies is replaced by one that resumes there, too; LearnerDiedError when that does not help.
     """
     deaths_n, resumed = 0, False
     while True:
@@ -111,7 +111,9 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         executor.sample(batch.missing, batch.snapshot, keep)
         files = [spool.path(number) for number in sorted(kept)]
     if not kept:
-        raise RunError(f"every episode of iteration {iteration} is left out; see {run.bundles}, mend, remove, --resume")
+        raise RunError(
+            f"every episode of iteration {iteration} is quarantined; see {run.bundles}, mend, remove, --resume"
+        )
     if config.run.pipelined and iteration + 1 < config.run.iterations:
         _sample_ahead(config, run, executor, iteration + 1)
     for phase in PHASES:

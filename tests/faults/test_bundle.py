@@ -121,7 +121,7 @@ def test_a_poison_episode_is_not_tried_again_until_its_bundle_is_removed(run: Ru
 def test_a_run_in_which_every_episode_fails_ends_with_one_sentence(run: Run) -> None:
     with pytest.raises(RunError, match=r"nothing but failures comes back; the last: episode 2: PhysicsError.*tripped"):
         trained(run, {0, 1, 2})
-    with pytest.raises(RunError, match="every episode of iteration 0 is left out"):
+    with pytest.raises(RunError, match="every episode of iteration 0 is quarantined"):
         trained(run, set())
 
 
