@@ -17,6 +17,8 @@ from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 
+pytestmark = pytest.mark.slow
+
 
 class StopsAfter(SerialExecutor):
     """Stops the run, as Ctrl-C would, before its nth episode or in a phase of iteration 1."""
