@@ -23,6 +23,8 @@ from t6gps.workers.episode.start import SETTLE_STEPS
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.robot.state import Array, RobotState
 
+pytestmark = pytest.mark.slow
+
 POISON, STEP = 1, 7
 CONFIG = {
     "run": {"episodes": 3, "steps": 30, "iterations": 1},

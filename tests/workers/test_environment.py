@@ -207,6 +207,7 @@ def test_unknown_options_and_difficulties_are_refused(environment: SuperBallEnvi
         SuperBallEnvironment(terrain=TerrainSettings(difficulty=1.6))
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_environments_in_processes_do_what_single_ones_do(environment: SuperBallEnvironment, context: str) -> None:
     # By module, since a spawned process starts without this one's imports.

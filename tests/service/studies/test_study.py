@@ -244,6 +244,7 @@ def test_an_unknown_study_is_refused() -> None:
         declared.find("horizont")
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("baseline", Baseline)
 def test_a_baseline_is_evaluated_on_the_episodes_of_its_run_and_kept(baseline: Baseline, tmp_path: Path) -> None:
     arm = Arm("baseline", "flat", "flat-quick", ("learner.value_from=0",), baseline=baseline)

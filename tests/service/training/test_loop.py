@@ -19,6 +19,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 
 PHASES_BY_NAME = {phase.name: phase for phase in PHASES}
+pytestmark = pytest.mark.slow
 
 
 class StopsAfter(SerialExecutor):

@@ -67,6 +67,7 @@ def test_an_unknown_name_is_answered_with_the_tables_and_their_columns(empty: Ru
         assert f"{name}: {', '.join(definition.names)}" in str(caught.value)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("sql", "reason"),
     [
@@ -139,12 +140,14 @@ def test_an_endless_query_is_stopped(empty: Run, sql: str) -> None:
         query(empty, sql, timeout_s=1.5)
 
 
+@pytest.mark.slow
 def test_memory_is_bounded(empty: Run) -> None:
     with pytest.raises(QueryError, match=r"(?s)Out of Memory.*filter by iteration") as caught:
         query(empty, "SELECT list(range) FROM range(300000000)")
     assert "SET" not in str(caught.value)
 
 
+@pytest.mark.slow
 def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
     script = "from t6gps.storage.sql import sandbox; sandbox._limit(1.0); print(len(bytes({bytes_n})))"
     small, large = (
@@ -157,6 +160,7 @@ def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
     assert "MemoryError" in large.stderr
 
 
+@pytest.mark.slow
 def test_the_result_is_bounded(empty: Run) -> None:
     with pytest.raises(QueryError, match=r"larger than 1 GB.*LIMIT"):
         query(empty, "SELECT range, range AS b, range AS c FROM range(50000000)")

@@ -71,6 +71,7 @@ def flat(worker: RolloutWorker) -> Episode:
     return worker.run(PLAN, random_policy())
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("difficulty", [0.0, 1.0])
 def test_an_episode_is_the_same_to_the_last_bit_in_a_used_worker_and_a_fresh_process(
     worker: RolloutWorker, difficulty: float

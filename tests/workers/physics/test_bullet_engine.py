@@ -230,6 +230,7 @@ def _digest(ground: Terrain | None, engine: PyBulletEngine) -> str:
     return hashlib.sha256(np.array([_numbers(state) for state in states]).tobytes()).hexdigest()
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("ground", [None, ROUGH], ids=["flat", "rough"])
 def test_an_episode_repeats_to_the_last_bit_in_a_fresh_process_and_a_used_client(ground: Terrain | None) -> None:
     fresh = subprocess.run(

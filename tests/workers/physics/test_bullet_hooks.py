@@ -145,6 +145,7 @@ def _motions() -> dict[str, Array]:
     }
 
 
+@pytest.mark.slow
 def test_motion_is_that_of_bullet_alone(tmp_path: Path) -> None:
     assert overrides.take_over()
     bare = {**os.environ, "T6GPS_PHYSICS": "bullet"}

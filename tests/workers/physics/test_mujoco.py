@@ -143,6 +143,7 @@ def test_flight_with_slack_cables_agrees_to_rounding(engines: Engines, seed: int
     np.testing.assert_allclose(second.node_velocities(), bullet.node_velocities(), atol=1e-10)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("faces", "height_m", "tension_n"),
     [(range(2), 1e-4, 0.1), (range(8, 11), 1e-3, 3.0)],
@@ -162,6 +163,7 @@ def test_a_standing_robot_has_the_same_height_and_tensions(
         assert tension_gap_n < tension_n
 
 
+@pytest.mark.slow
 def test_dropped_robots_bounce_alike(engines: Engines) -> None:
     """Measured over 20 orientations: CoM heights within 1.3 mm for 0.3 s (the first contact is at 0.25 s), within
     16 mm for 1.5 s; lowest point of the bounce within 3.5 mm; height at rest within 3.8 mm."""
@@ -175,6 +177,7 @@ def test_dropped_robots_bounce_alike(engines: Engines) -> None:
         assert abs(at_rest[0] - at_rest[1]) < 0.008
 
 
+@pytest.mark.slow
 def test_rolling_robots_change_triangles_alike(engines: Engines) -> None:
     """Measured over these ten starts: CoM gap until the first change of the triangle 0.4 mm (median), 2.6 mm (worst);
     distance rolled in 4 s, 1.1 m on average, within 8 mm (median), 18 cm (worst); equal numbers of changes.
