@@ -1,7 +1,4 @@
-"""Laws of the house: small folders, classes and functions, few untyped values, tests that use what is public.
-
-What exceeds a limit today is listed by name. A list or a count may become shorter, never longer.
-"""
+"""Laws of the house: small folders, classes and functions, few untyped values, tests that use what is public."""
 
 from __future__ import annotations
 
@@ -13,12 +10,8 @@ from pathlib import Path
 REPOSITORY = Path(__file__).parents[1]
 ROOMS = tomllib.loads((REPOSITORY / "pyproject.toml").read_text())["tool"]["setuptools"]["package-dir"].values()
 
-MODULES_MOST_N, CLASS_LINES_MOST_N, FUNCTION_LINES_MOST_N = 12, 150, 60
-CROWDED_FOLDERS: set[str] = set()
-LONG_CLASSES: set[str] = set()
-LONG_FUNCTIONS: set[str] = set()
-ANY_MOST_N = 60
-PRIVATE_MEMBERS_MOST_N, PATCHES_MOST_N = 5, 8
+MODULES_MOST_N, CLASS_LINES_MOST_N, FUNCTION_LINES_MOST_N = 12, 150, 50
+ANY_MOST_N, PRIVATE_MEMBERS_MOST_N, PATCHES_MOST_N = 60, 5, 8
 
 
 def parsed(folders: Iterator[Path]) -> dict[str, ast.Module]:
@@ -67,15 +60,15 @@ def test_no_folder_is_crowded() -> None:
     for module in PACKAGE:
         folder, _, name = module.rpartition("/")
         folders[folder] = folders.get(folder, 0) + (name != "__init__.py")
-    assert {folder for folder, modules in folders.items() if modules > MODULES_MOST_N} <= CROWDED_FOLDERS
+    assert not {folder for folder, modules in folders.items() if modules > MODULES_MOST_N}
 
 
 def test_no_class_is_long() -> None:
-    assert longer_than(CLASS_LINES_MOST_N, ast.ClassDef) <= LONG_CLASSES
+    assert not longer_than(CLASS_LINES_MOST_N, ast.ClassDef)
 
 
 def test_no_function_is_long() -> None:
-    assert longer_than(FUNCTION_LINES_MOST_N, ast.FunctionDef, ast.AsyncFunctionDef) <= LONG_FUNCTIONS
+    assert not longer_than(FUNCTION_LINES_MOST_N, ast.FunctionDef, ast.AsyncFunctionDef)
 
 
 def test_few_values_are_untyped() -> None:
