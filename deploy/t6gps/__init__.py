@@ -33,7 +33,7 @@ else:
         "T6GpsError": "t6gps.storage.errors",
     }
 
-    def __getattr__(name):
+    def __getattr__(name: str) -> object:
         import importlib
 
         if name == "__version__":
@@ -47,7 +47,7 @@ else:
         globals()[name] = value
         return value
 
-    def __dir__():
+    def __dir__() -> list[str]:
         return sorted({*globals(), *__all__})
 
 

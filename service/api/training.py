@@ -114,8 +114,8 @@ def evaluate(
     checkpoint.
     """
     for what, value, least in (("episodes", episodes, 2), ("seed", seed, 0), ("terrain_seed", terrain_seed or 0, 0)):
-        if value < least:
-            raise ConfigError(f"evaluate takes {what} >= {least}, found {value!r}; give another number")
+        if not isinstance(value, int) or value < least:
+            raise ConfigError(f"evaluate takes a whole {what} >= {least}, found {value!r}; give another number")
     folder = catalog.Run(run.path)
     config = session.evaluation_config(folder, _overrides(settings, workers))
     with closing(session.restored(config, folder, serial)) as executor:

@@ -209,6 +209,7 @@ def test_an_error_of_progress_stops_the_run_which_can_be_resumed(
         (lambda run: t6gps.train("flat-quick", root=run.path.parent, name=run.name, resume=True), t6gps.RunError,
          "another configuration"),
         (lambda run: t6gps.evaluate(run, episodes=1), t6gps.ConfigError, "episodes >= 2, found 1"),
+        (lambda run: t6gps.evaluate(run, episodes=2.5), t6gps.ConfigError, "whole episodes >= 2, found 2.5"),
         (lambda run: t6gps.evaluate(run, seed=-1), t6gps.ConfigError, "seed >= 0, found -1"),
         (lambda run: t6gps.evaluate(run, settings={"learner.modes": 3}), t6gps.ConfigError, "cannot change learner"),
         (lambda run: t6gps.open_run(run.path / "nothing"), t6gps.RunError, "there is no run 'nothing'"),
