@@ -107,7 +107,7 @@ def tiny(tmp_path_factory: pytest.TempPathFactory) -> Trained:
 
 
 @pytest.fixture(scope="session")
-def ray_head() -> Iterator[str]:
-    """Address of a Ray of two CPUs that tests join and leave as it is; see `house.joining`."""
-    with house.head() as address:
-        yield address
+def ray_head() -> Iterator[dict[str, str]]:
+    """A Ray of two CPUs that tests join (`house.joining`) and leave as it is."""
+    with house.head() as variables:
+        yield variables

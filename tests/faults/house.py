@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+import os
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from functools import partial
 from itertools import pairwise
@@ -55,21 +56,23 @@ def add_node(nodes: Cluster, cpus: int = 1) -> None:
 
 
 @contextmanager
-def joining(address: str) -> Iterator[None]:
-    """Executors that start meanwhile join the Ray at an address."""
+def joining(head_: Mapping[str, str]) -> Iterator[None]:
+    """Executors that start meanwhile join the Ray of a `head`."""
     with pytest.MonkeyPatch.context() as environment:
-        environment.setenv("RAY_ADDRESS", address)
+        for name, value in head_.items():
+            environment.setenv(name, value)
         yield
 
 
 @contextmanager
-def head() -> Iterator[str]:
-    """The address of a Ray of two CPUs on the loopback address."""
+def head() -> Iterator[dict[str, str]]:
+    """A Ray of two CPUs on the loopback address: the variables of those who join it."""
     private.prepare_start()
     cluster = Cluster()
     try:
         add_node(cluster, cpus=2)
-        yield cluster.address
+        settings = {name: value for name, value in os.environ.items() if name.startswith("RAY_")}
+        yield settings | {"RAY_ADDRESS": cluster.address}
     finally:
         cluster.shutdown()
 

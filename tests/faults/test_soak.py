@@ -123,7 +123,7 @@ def _available() -> dict[str, float]:
 
 
 @pytest.fixture
-def soak(ray_head: str, tmp_path: Path) -> Iterator[Soak]:
+def soak(ray_head: dict[str, str], tmp_path: Path) -> Iterator[Soak]:
     with joining(ray_head):
         soak = Soak(tmp_path)
     with catalog.locked(soak.run):

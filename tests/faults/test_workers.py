@@ -41,7 +41,7 @@ BATCH_S = 1.0
 
 
 @pytest.fixture(scope="module")
-def everything(ray_head: str, tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
+def everything(ray_head: dict[str, str], tmp_path_factory: pytest.TempPathFactory) -> Iterator[House]:
     with joining(ray_head):
         house = House(tmp_path_factory.mktemp("faults"))
     with catalog.locked(house.run):

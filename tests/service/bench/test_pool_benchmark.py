@@ -29,7 +29,7 @@ def ignored(_: str) -> None:
 
 
 @pytest.mark.slow
-def test_every_figure_is_there_and_positive(ray_head: str) -> None:
+def test_every_figure_is_there_and_positive(ray_head: dict[str, str]) -> None:
     sizes = Sizes(seconds=1.0, rounds=1, versions_n=1, kills_n=1, hangs_n=1, pools=(4,), large_pool_s=1.0)
     lines: list[str] = []
     with joining(ray_head):

@@ -113,7 +113,7 @@ def pipelined(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
     ids=["ordinary", "sampling-ahead"],
 )
 def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
-    ray_head: str,
+    ray_head: dict[str, str],
     tmp_path: Path,
     request: pytest.FixtureRequest,
     settings: list[str],
@@ -131,7 +131,7 @@ def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
 
 @pytest.mark.slow
 def test_t10_t15_a_run_that_is_stopped_while_it_samples_ahead_goes_on_with_the_same_bytes(
-    ray_head: str, tmp_path: Path, pipelined: dict[str, str]
+    ray_head: dict[str, str], tmp_path: Path, pipelined: dict[str, str]
 ) -> None:
     config = load("flat-quick", [*PIPELINED, "run.workers=2"])
     run = catalog.create(tmp_path, "stopped", config.to_json())
