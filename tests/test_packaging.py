@@ -83,7 +83,8 @@ def test_the_wheel_is_typed_compiled_modules_included(wheel: Path) -> None:
 def test_an_installed_wheel_runs_without_the_repository(wheel: Path, tmp_path: Path) -> None:
     zipfile.ZipFile(wheel).extractall(tmp_path / "site")
     # Without site (-S) the editable installation of this environment is not found; its dependencies still are.
-    path = os.pathsep.join([str(tmp_path / "site"), sysconfig.get_path("platlib")])
+    dependencies = [entry for entry in sys.path if Path(entry).name == "site-packages"]
+    path = os.pathsep.join([str(tmp_path / "site"), *dependencies])
     arguments = ["--root", str(tmp_path / "runs"), "--serial", "--set=run.episodes=2", "--set=run.iterations=1"]
     done = subprocess.run(
         [sys.executable, "-S", "-m", "t6gps", "train", "flat-quick", *arguments, "--set=run.steps=20"],

@@ -49,7 +49,11 @@ def efficiency(tallies: Sequence[Tally], reference: Sequence[Tally]) -> float:
     return float(np.median([tally.steps_per_s / plain.steps_per_s for tally, plain in pairs]))
 
 
-def cpu_efficiency(tallies: Sequence[Tally], reference: Sequence[Tally]) -> float:
-    """The same ratio for the share of the machine's processor time that goes into simulation."""
+def cpu_efficiency(tallies: Sequence[Tally], reference: Sequence[Tally]) -> float | None:
+    """The same ratio for the share of the machine's processor time that goes into simulation.
+
+    None where no round of the reference lasted long enough: it takes a process three episodes to know.
+    """
     pairs = zip(tallies, reference, strict=True)
-    return float(np.median([tally.simulating / plain.simulating for tally, plain in pairs]))
+    ratios = [tally.simulating / plain.simulating for tally, plain in pairs if plain.simulating]
+    return float(np.median(ratios)) if ratios else None

@@ -40,7 +40,10 @@ def test_every_figure_is_there_and_positive(ray_head: dict[str, str]) -> None:
     expected += [f"cpu_s_per_1000_steps_{role}" for role in ROLES]
     expected += ["pool_4_supervisor_ms"]
     assert not set(expected) - set(results)
-    assert all(value is not None and value > 0 for key, value in results.items() if "cpu_s" not in key)
+    assert all(value is not None and value > 0 for key, value in results.items() if "cpu" not in key)
+    for efficiency in EFFICIENCIES:  # on a busy machine a second may be too short for them
+        value = results[f"cpu_{efficiency}"]
+        assert value is None or value >= 0
     assert results["cpu_s_per_1000_steps_worker"] > results["cpu_s_per_1000_steps_committer"] > 0
 
 
@@ -75,6 +78,7 @@ def test_ratios_are_those_of_a_round_and_their_median_counts() -> None:
     served = [tally(90, 0.9), tally(100, 0.4), tally(320, 0.5)]
     assert rounds.efficiency(served, plain) == 0.8
     assert rounds.cpu_efficiency(served, plain) == 0.9
+    assert rounds.cpu_efficiency(served, [tally(100, 0.0)] * 3) is None
     assert rounds.steps_per_s(plain) == 20.0
 
 
