@@ -6,9 +6,6 @@ fails in C, and an episode that always raises. Run it again when the supervisor 
 
 from __future__ import annotations
 
-import t6gps.service  # noqa: F401 - first: it sets what must be set before ray is loaded
-
-# isort: split
 import os
 import re
 import signal
