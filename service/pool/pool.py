@@ -6,31 +6,11 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from t6gps.service.pool import control
+from t6gps.service.pool import control, messages
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.control import Control, Status
 from t6gps.service.pool.decision_log import DecisionLog
-from t6gps.service.pool.messages import (
-    Accept,
-    AskCapacity,
-    Capacity,
-    Durable,
-    End,
-    Ended,
-    Failed,
-    Instruction,
-    Observation,
-    Opened,
-    Ping,
-    PostMortem,
-    Publish,
-    Quarantine,
-    Sampled,
-    ScaleRequested,
-    Send,
-    Start,
-    Unserved,
-)
+from t6gps.service.pool.messages import Instruction, Observation
 from t6gps.service.pool.state import Ending, PoolState, RunState, WorkerId
 from t6gps.service.pool.supervisor import decide
 from t6gps.service.pool.transport import Done, Transport
@@ -73,7 +53,7 @@ class Pool:
         self.ticked_s = self._clock()
         workers = self._control.scale_request()
         if workers is not None:
-            self._unseen.append(ScaleRequested(workers))
+            self._unseen.append(messages.ScaleRequested(workers))
         self._decide()
         if self._control.due(self.ticked_s, self.state.condition):
             self._control.publish(self.status())
@@ -86,7 +66,7 @@ class Pool:
         """Begin a batch; what comes of other plans than these is late."""
         self._accepted.clear()
         self.phase = "sampling"
-        self._unseen.append(Opened(tuple(plans), tuple(quarantined), policy_digests))
+        self._unseen.append(messages.Opened(tuple(plans), tuple(quarantined), policy_digests))
         self._decide()
 
     def sample(self, keep: Callable[[Episode], None]) -> None:
@@ -102,7 +82,7 @@ class Pool:
         while self._accepted:
             episode_id, episode = self._accepted.popleft()
             keep(episode)
-            self._unseen.append(Durable(episode_id))
+            self._unseen.append(messages.Durable(episode_id))
             self._decide()
 
     def close(self, condition: RunState, reason: str) -> None:
@@ -133,12 +113,14 @@ class Pool:
             if not isinstance(report, Done):
                 self._unseen.append(report)
             elif report.result is None:
-                self._unseen.append(Unserved(report.worker, report.plan))
+                self._unseen.append(messages.Unserved(report.worker, report.plan))
             elif isinstance(report.result, Failure):
-                self._unseen.append(Failed(report.worker, report.plan, report.result, report.policy_digest))
+                self._unseen.append(messages.Failed(report.worker, report.plan, report.result, report.policy_digest))
             else:
                 self._came[report.worker, report.plan.episode_id] = report.result
-                self._unseen.append(Sampled(report.worker, report.plan, report.result.nbytes, report.policy_digest))
+                self._unseen.append(
+                    messages.Sampled(report.worker, report.plan, report.result.nbytes, report.policy_digest)
+                )
 
     def _decide(self) -> None:
         """Decide and carry out, until nothing new follows from it."""
@@ -157,24 +139,24 @@ class Pool:
 
     def _carry_out(self, instruction: Instruction) -> None:
         match instruction:
-            case Start():
+            case messages.Start():
                 self._transport.start(instruction.worker)
-            case Send():
+            case messages.Send():
                 self._transport.send(instruction.worker, instruction.plan)
-            case Ping():
+            case messages.Ping():
                 self._transport.ping(instruction.worker)
-            case End():
+            case messages.End():
                 drained = instruction.why is Ending.DRAINED
-                post_mortem = PostMortem() if drained else self._transport.examine(instruction.worker)
+                post_mortem = messages.PostMortem() if drained else self._transport.examine(instruction.worker)
                 self._transport.kill(instruction.worker)
-                self._unseen.append(Ended(instruction.worker, post_mortem))
-            case AskCapacity():
+                self._unseen.append(messages.Ended(instruction.worker, post_mortem))
+            case messages.AskCapacity():
                 waiting = tuple(worker for worker in instruction.starting if not self._transport.placed(worker))
-                self._unseen.append(Capacity(self._transport.free_workers(), waiting))
-            case Accept():
+                self._unseen.append(messages.Capacity(self._transport.free_workers(), waiting))
+            case messages.Accept():
                 episode = self._came.pop((instruction.worker, instruction.episode_id))
                 self._accepted.append((instruction.episode_id, episode))
-            case Quarantine():
+            case messages.Quarantine():
                 self._quarantine(instruction.plan)
-            case Publish():
+            case messages.Publish():
                 self._control.publish(self.status())

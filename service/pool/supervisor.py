@@ -11,37 +11,15 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 
-from t6gps.service.pool import scaling
+from t6gps.service.pool import messages, scaling
 from t6gps.service.pool.attempt import Failure, FailureKind
-from t6gps.service.pool.messages import (
-    Accept,
-    Alive,
-    Capacity,
-    Died,
-    Durable,
-    End,
-    Ended,
-    Failed,
-    Instruction,
-    Observation,
-    Opened,
-    Ping,
-    PostMortem,
-    Publish,
-    Quarantine,
-    Ready,
-    Sampled,
-    ScaleRequested,
-    Send,
-    Start,
-    Unserved,
-)
+from t6gps.service.pool.messages import Instruction, Observation
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
 from t6gps.service.pool.state import Ending, PoolState, RunState, Slot, Worker, WorkerId, WorkerPhase
 from t6gps.storage.records import EpisodePlan
 
 BREAKER_N = 5
-"""So many starts in a row that fail, with no worker left, open the breaker."""
+"""Starts in a row that fail, with no worker left, until the breaker opens."""
 
 
 def decide(state: PoolState, observed: Sequence[Observation], now: float) -> list[Instruction]:
@@ -58,24 +36,24 @@ def decide(state: PoolState, observed: Sequence[Observation], now: float) -> lis
     before = state.condition, state.reason
     _update_condition(state)
     if (state.condition, state.reason) != before:
-        instructions.append(Publish(state.condition, state.reason))
+        instructions.append(messages.Publish(state.condition, state.reason))
     return instructions
 
 
 def _observe(state: PoolState, observation: Observation, now: float) -> Iterator[Instruction]:
     match observation:
-        case Opened():
+        case messages.Opened():
             state.policy_digests = dict(observation.policy_digests)
             state.ledger.open(observation.plans, observation.quarantined)
-        case Durable():
+        case messages.Durable():
             state.ledger.commit(observation.episode_id)
-        case Capacity():
+        case messages.Capacity():
             state.free_n = observation.free_n
             for each in state.workers.values():
                 each.placed = each.id not in observation.waiting
-        case ScaleRequested():
+        case messages.ScaleRequested():
             state.wanted, state.autoscale = observation.workers, None  # scaled by hand: it stays so
-        case Ended():
+        case messages.Ended():
             yield from _on_ended(state, observation.worker, observation.post_mortem)
         case _:
             worker = state.worker(observation.worker)
@@ -85,7 +63,7 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
 
 def _on_report(state: PoolState, worker: Worker, report: Observation, now: float) -> Iterator[Instruction]:
     match report:
-        case Ready():
+        case messages.Ready():
             if report.identity.settings_digest != state.settings_digest:
                 why = "has other settings than the run; install the same version on every node"
                 _fail(state, f"worker {worker.id} {why}")
@@ -93,24 +71,24 @@ def _on_report(state: PoolState, worker: Worker, report: Observation, now: float
             worker.identity, worker.since_s = report.identity, now
             worker.enter(WorkerPhase.IDLE)
             state.failed_starts_n = 0
-        case Alive():
+        case messages.Alive():
             worker.answered = True
-        case Died():
+        case messages.Died():
             yield _end(state, worker, now, Ending.CRASH, report.error, report.message)
-        case Unserved():
+        case messages.Unserved():
             _on_result(state, worker, report.plan, now)
             state.ledger.give_back(*worker.id)
             worker.plans.clear()
             _begin_episode(state, worker, now)
-        case Failed() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
+        case messages.Failed() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
             _on_result(state, worker, report.plan, now)
             yield from _record_failure(state, report.plan, report.failure)
-        case Sampled() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
+        case messages.Sampled() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
             state.times.add(_on_result(state, worker, report.plan, now), report.plan.steps)
             state.slots[worker.id.slot].failures_n = 0
             state.largest_bytes = max(state.largest_bytes, report.nbytes)
             if state.ledger.arrive(report.plan):
-                yield Accept(worker.id, report.plan.episode_id)
+                yield messages.Accept(worker.id, report.plan.episode_id)
 
 
 def _on_result(state: PoolState, worker: Worker, plan: EpisodePlan, now: float) -> float:
@@ -148,10 +126,10 @@ def _acted_as_planned(state: PoolState, worker: Worker, plan: EpisodePlan, polic
 def _record_failure(state: PoolState, plan: EpisodePlan, failure: Failure) -> Iterator[Instruction]:
     state.last_trouble = f"episode {plan.episode_id}: {failure}"
     if state.ledger.fail(plan, failure):
-        yield Quarantine(plan)
+        yield messages.Quarantine(plan)
 
 
-def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str = "", message: str = "") -> End:
+def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str = "", message: str = "") -> messages.End:
     """The one way in which a worker goes, planned (drained) or not."""
     if why is not Ending.DRAINED:
         state.slots[worker.id.slot].failed(now)
@@ -160,10 +138,10 @@ def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str =
     state.counters[why] += 1
     worker.ending = why, error, message
     worker.enter(WorkerPhase.ENDING)
-    return End(worker.id, why)
+    return messages.End(worker.id, why)
 
 
-def _on_ended(state: PoolState, worker_id: WorkerId, post_mortem: PostMortem) -> Iterator[Instruction]:
+def _on_ended(state: PoolState, worker_id: WorkerId, post_mortem: messages.PostMortem) -> Iterator[Instruction]:
     """The worker is gone: blame the episode in hand if it is at fault, and give back the others."""
     worker = state.workers.pop(worker_id.slot)
     assert worker.id == worker_id and worker.ending is not None, "only a worker that is to end is ended"
@@ -196,7 +174,7 @@ def _end_overdue(state: PoolState, now: float) -> Iterator[Instruction]:
                 yield _end(state, worker, now, Ending.HANG, "Hang", f"no sign of life for {silent_s:.1f} s")
             elif worker.answered and silent_s > timings.ping_s:
                 worker.pinged_s, worker.answered = now, False
-                yield Ping(worker.id)
+                yield messages.Ping(worker.id)
 
 
 def _drain(state: PoolState, now: float) -> Iterator[Instruction]:
@@ -228,7 +206,7 @@ def _fill(state: PoolState, now: float) -> Iterator[Instruction]:
         state.workers[number] = Worker(worker, now)
         state.free_n -= 1
         state.counters["started"] += 1
-        yield Start(worker)
+        yield messages.Start(worker)
 
 
 def _send(state: PoolState, now: float) -> Iterator[Instruction]:
@@ -242,7 +220,7 @@ def _send(state: PoolState, now: float) -> Iterator[Instruction]:
             worker.plans.append(plan)
             if len(worker.plans) == 1:
                 _begin_episode(state, worker, now)
-            yield Send(worker.id, plan)
+            yield messages.Send(worker.id, plan)
 
 
 def _credit(state: PoolState) -> bool:
