@@ -1,0 +1,68 @@
+"""Laws of the stream to the learner: it is bounded while the learner stands still, and nothing of it is lost."""
+
+from __future__ import annotations
+
+import os
+import signal
+import threading
+import time
+from contextlib import closing
+from typing import Any
+
+import pytest
+import ray
+from house import joining
+
+from t6gps.learner.phases import PHASES
+from t6gps.service import seeding
+from t6gps.service.config import load
+from t6gps.service.execution.ray_executor import RayExecutor
+from t6gps.service.execution.ray_learner import EPISODES_UNDER_WAY_N
+from t6gps.service.execution.serial import SerialExecutor
+from t6gps.storage.records import Episode
+
+SETTINGS = ["run.episodes=60", "run.steps=10", "learner.smallest_class_segments=4", "learner.epochs=1"]
+PAUSE_S = 60.0 if "T6GPS_SOAK_MINUTES" in os.environ else 3.0
+WORKERS_N = 2
+
+
+@pytest.mark.slow
+def test_t13_while_the_learner_stands_still_sampling_waits_and_then_ends_with_the_same_policy(
+    ray_head: dict[str, str],
+) -> None:
+    config = load("flat-quick", [*SETTINGS, f"run.workers={WORKERS_N}", "run.cpus_per_worker=0.5"])
+    plans = seeding.training_plans(config, 0)
+    kept_s: list[float] = []
+    resumed_s: list[float] = []
+    with joining(ray_head), closing(RayExecutor(config)) as executor:
+        learner: Any = executor.learner.actor
+        process = ray.get(learner.__ray_call__.remote(lambda _: os.getpid()))
+
+        def resume() -> None:
+            resumed_s.append(time.monotonic())
+            os.kill(process, signal.SIGCONT)
+
+        def keep(episode: Episode) -> None:
+            if not kept_s:
+                os.kill(process, signal.SIGSTOP)
+                threading.Timer(PAUSE_S, resume).start()
+            kept_s.append(time.monotonic())
+            executor.feed(episode)
+
+        executor.sample(plans, executor.learner.policy(), keep)
+        for phase in PHASES:
+            list(executor.learn(phase))
+        streamed = executor.learner.policy()
+    assert len(kept_s) == len(plans)
+    before_n = sum(at_s < resumed_s[0] for at_s in kept_s)
+    assert before_n == EPISODES_UNDER_WAY_N + 1  # one more is being handed over when sampling waits
+
+    serial = SerialExecutor(config)
+    with closing(serial):
+        serial.sample(plans, serial.learner.policy(), serial.feed)
+        for phase in PHASES:
+            list(serial.learn(phase))
+    for (weight, bias), (expected_weight, expected_bias) in zip(
+        streamed.layers, serial.learner.policy().layers, strict=True
+    ):
+        assert (weight == expected_weight).all() and (bias == expected_bias).all()
