@@ -1,7 +1,7 @@
 """Digests of everything that a run's data hold: `python tests/run_digest.py RUN_FOLDER ...`.
 
 Runs with the same digests hold the same bytes: rows of the tables, whatever their order, arrays of the newest
-checkpoint, and the evaluation. Durations are left out; they alone differ between two runs of one configuration.
+checkpoint, and the evaluation. Durations do not count; they alone differ between two runs of one configuration.
 """
 
 from __future__ import annotations

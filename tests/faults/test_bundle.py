@@ -25,7 +25,7 @@ from t6gps.workers.robot.state import Array, RobotState
 
 pytestmark = pytest.mark.slow
 
-POISON, STEP = 1, 7
+FAILING, STEP = 1, 7
 CONFIG = {
     "run": {"episodes": 3, "steps": 30, "iterations": 1},
     "learner": {"smallest_class_segments": 4, "epochs": 2, "hidden_layers": (16,)},
@@ -33,7 +33,7 @@ CONFIG = {
 
 
 class Tripping(PyBulletEngine):
-    """Fails in the poison episode's step STEP, whenever that is run."""
+    """Fails in the failing episode's step STEP, whenever that is run."""
 
     armed = False
 
@@ -49,14 +49,14 @@ class Tripping(PyBulletEngine):
 
 
 class Executor(SerialExecutor):
-    """Trips in episodes that are poison."""
+    """Trips in failing episodes."""
 
-    def __init__(self, config: Config, run: Run, poison: set[int]) -> None:
+    def __init__(self, config: Config, run: Run, failing: set[int]) -> None:
         super().__init__(config, run, Tripping)
         worker_run = self._worker.run
 
         def tripping(plan: Any, snapshot: Any) -> Any:
-            Tripping.armed = plan.episode_id in poison
+            Tripping.armed = plan.episode_id in failing
             return worker_run(plan, snapshot)
 
         self._worker.run = tripping  # type: ignore[method-assign]
@@ -76,16 +76,16 @@ def run(tmp_path: Path) -> Run:
     return catalog.create(tmp_path, "tripped", config.to_json())
 
 
-def trained(run: Run, poison: set[int], watcher: Watcher | None = None) -> None:
-    executor = Executor(Config.model_validate(CONFIG), run, poison)
+def trained(run: Run, failing: set[int], watcher: Watcher | None = None) -> None:
+    executor = Executor(Config.model_validate(CONFIG), run, failing)
     try:
         loop.train(executor.config, run, executor, watcher or Watcher())
     finally:
         executor.close()
 
 
-def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(run: Run) -> None:
-    trained(run, {POISON})
+def test_t3_a_run_goes_on_without_a_failing_episode_and_keeps_its_last_states(run: Run) -> None:
+    trained(run, {FAILING})
     assert tables.read(run, "episodes")["episode_id"].to_pylist() == [0, 2]
     assert tables.read(run, "iterations").select(["episodes", "left_out"]).to_pylist() == [
         {"episodes": 2, "left_out": 1}
@@ -95,9 +95,9 @@ def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(run
     ledger: Any = latest[1]["ledger"]
     assert ledger["counters"]["quarantined"] == 1
     assert ledger["counters"]["committed"] == 2
-    path = run.bundles / f"episode-{POISON}.json"
+    path = run.bundles / f"episode-{FAILING}.json"
     kept = crash_bundle.read(path)
-    assert kept.plan == seeding.training_plans(Config.model_validate(CONFIG), 0)[POISON]
+    assert kept.plan == seeding.training_plans(Config.model_validate(CONFIG), 0)[FAILING]
     assert len(kept.failures) == 3
     for failure in kept.failures:
         assert (failure["error"], failure["step"], failure["seed"]) == ("PhysicsError", STEP, kept.plan.seed)
@@ -107,13 +107,13 @@ def test_t3_a_run_goes_on_without_a_poison_episode_and_keeps_its_last_states(run
     assert (again["now"], again["steps"], again["ended_by"]) == ("succeeded", 30, "completed")
 
 
-def test_a_poison_episode_is_not_tried_again_until_its_bundle_is_removed(run: Run) -> None:
+def test_a_failing_episode_is_not_tried_again_until_its_bundle_is_removed(run: Run) -> None:
     with pytest.raises(KeyboardInterrupt):
-        trained(run, {POISON}, Stops())
-    bundle = run.bundles / f"episode-{POISON}.json"
+        trained(run, {FAILING}, Stops())
+    bundle = run.bundles / f"episode-{FAILING}.json"
     written_ns = bundle.stat().st_mtime_ns
     with pytest.raises(KeyboardInterrupt):
-        trained(run, {POISON}, Stops())
+        trained(run, {FAILING}, Stops())
     assert bundle.stat().st_mtime_ns == written_ns
     bundle.unlink()
     trained(run, set())

@@ -95,7 +95,7 @@ def test_t1_killed_workers_lose_nothing_and_are_replaced(house: House, wait_unti
     assert len(house.executor.ledger.quarantined) == quarantined_n
 
 
-def test_an_episode_whose_workers_are_killed_from_outside_is_innocent(house: House) -> None:
+def test_an_episode_whose_workers_are_killed_from_outside_is_not_at_fault(house: House) -> None:
     number, killed = house.order(5, "slow"), list[int]()
 
     def kill(_: float) -> None:

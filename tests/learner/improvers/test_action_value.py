@@ -1,4 +1,4 @@
-"""The action value: a planted world in which the best command is known, its slope, and going on from a checkpoint."""
+"""The action value: a planted world in which the best command is known, its slope, and continuing from a checkpoint."""
 
 from __future__ import annotations
 
@@ -125,11 +125,11 @@ def test_the_slope_is_that_of_the_value(value: ActionValue) -> None:
 
 
 def test_the_last_row_of_an_episode_is_no_transition(value: ActionValue) -> None:
-    """What stands in it besides its state is never read: poison it."""
-    poisoned = planted(0)
-    assert isinstance(poisoned.wide, Held)
-    poisoned.wide.parts[-1][~poisoned.acts] = np.nan
-    assert same(learned(poisoned).arrays(), value.arrays())
+    """What stands in it besides its state is never read: spoil it."""
+    spoiled = planted(0)
+    assert isinstance(spoiled.wide, Held)
+    spoiled.wide.parts[-1][~spoiled.acts] = np.nan
+    assert same(learned(spoiled).arrays(), value.arrays())
 
 
 def test_learning_is_a_function_of_its_arguments_whatever_part_of_a_batch_is_done_first(

@@ -77,7 +77,7 @@ def test_what_comes_from_another_iteration_is_late_and_counted(ledger: Ledger) -
     assert ledger.backlog == 1
 
 
-def test_leases_of_the_same_plans_outlive_a_new_book(ledger: Ledger) -> None:
+def test_leases_of_the_same_plans_outlive_a_new_batch(ledger: Ledger) -> None:
     ledger.open(plans(3))
     ledger.lease(0, 1)
     ledger.open(plans(3))
@@ -86,18 +86,18 @@ def test_leases_of_the_same_plans_outlive_a_new_book(ledger: Ledger) -> None:
 
 
 def test_an_episode_that_fails_three_times_is_quarantined_and_nothing_else_is(ledger: Ledger) -> None:
-    poison, sound = plans(2)
-    ledger.open([poison, sound])
+    failing, sound = plans(2)
+    ledger.open([failing, sound])
     for attempt in range(1, FAILURES_ALLOWED_N + 1):
-        assert ledger.lease(0, 1) == poison
-        assert ledger.fail(poison, failure()) == (attempt == FAILURES_ALLOWED_N)
+        assert ledger.lease(0, 1) == failing
+        assert ledger.fail(failing, failure()) == (attempt == FAILURES_ALLOWED_N)
     assert ledger.lease(0, 1) == sound
     assert ledger.quarantined == {0}
     assert len(ledger.failures[0]) == FAILURES_ALLOWED_N
     assert (ledger.counters["failures"], ledger.counters["quarantined"]) == (3, 1)
 
 
-def test_an_episode_whose_worker_is_lost_is_innocent_until_no_accident_explains_it(ledger: Ledger) -> None:
+def test_an_episode_whose_worker_is_lost_is_not_at_fault_until_no_accident_explains_it(ledger: Ledger) -> None:
     (plan,) = plans(1)
     ledger.open([plan])
     for attempt in range(1, ATTEMPTS_ALLOWED_N + 1):
@@ -115,35 +115,35 @@ def test_lost_attempts_do_not_add_to_failures(ledger: Ledger) -> None:
         assert ledger.fail(plan, failure(kind)) == (kind == "raised")
 
 
-def test_quarantined_episodes_are_left_out_of_a_new_book(ledger: Ledger) -> None:
+def test_quarantined_episodes_are_left_out_of_a_new_batch(ledger: Ledger) -> None:
     ledger.open(plans(3), quarantined=[1])
     leased = [ledger.lease(0, 1) for _ in range(3)]
     assert leased == [plans(3)[0], plans(3)[2], None]
 
 
-def test_nothing_but_failures_is_hopeless_and_a_single_poison_seed_is_not(ledger: Ledger) -> None:
-    book = plans(HOPELESS_N + 1)
-    ledger.open(book)
-    for plan in book[:HOPELESS_N]:
+def test_nothing_but_failures_is_hopeless_and_a_single_failing_seed_is_not(ledger: Ledger) -> None:
+    batch = plans(HOPELESS_N + 1)
+    ledger.open(batch)
+    for plan in batch[:HOPELESS_N]:
         assert not ledger.hopeless
         for _ in range(FAILURES_ALLOWED_N):
             ledger.lease(0, 1)
             ledger.fail(plan, failure())
     assert ledger.hopeless
     again = Ledger()
-    again.open(book[:1])
+    again.open(batch[:1])
     for _ in range(FAILURES_ALLOWED_N):
         again.lease(0, 1)
-        again.fail(book[0], failure())
+        again.fail(batch[0], failure())
     assert again.hopeless  # it was all there was
     mixed = Ledger()
-    mixed.open(book[:2])
+    mixed.open(batch[:2])
     mixed.lease(0, 1)
-    mixed.arrive(book[0])
+    mixed.arrive(batch[0])
     mixed.commit(0)
     for _ in range(FAILURES_ALLOWED_N):
         mixed.lease(0, 1)
-        mixed.fail(book[1], failure())
+        mixed.fail(batch[1], failure())
     assert not mixed.hopeless
 
 
@@ -162,8 +162,8 @@ def test_counters_go_on_after_a_restart(ledger: Ledger) -> None:
 @pytest.mark.parametrize("seed", range(20))
 def test_whatever_happens_every_plan_is_committed_once(ledger: Ledger, seed: int) -> None:
     """Random leases, losses, duplicates and failures, two per episode at most."""
-    rng, book = random.Random(seed), plans(12)
-    ledger.open(book)
+    rng, batch = random.Random(seed), plans(12)
+    ledger.open(batch)
     failed = dict.fromkeys(range(12), 0)
     committed: list[int] = []
     sent: list[EpisodePlan] = []

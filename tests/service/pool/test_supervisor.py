@@ -336,7 +336,7 @@ def test_an_idle_worker_that_gives_no_sign_of_life_is_replaced() -> None:
     assert house.pool.state.workers[1].id.incarnation == 1
 
 
-def test_a_poison_episode_is_quarantined_after_three_failures_and_the_run_goes_on() -> None:
+def test_an_episode_that_always_raises_is_quarantined_after_three_failures_and_the_run_continues() -> None:
     house = House(2, 12)
     house.paper.raising.add(5)
     assert sorted(house.sample()) == [n for n in range(12) if n != 5]
@@ -363,23 +363,23 @@ def test_a_run_in_which_everything_fails_ends_with_one_sentence() -> None:
     assert house.pool.state.condition == "FAILED"
 
 
-def test_scaling_reaches_its_wish_while_sampling_and_loses_nothing() -> None:
+def test_scaling_reaches_what_was_asked_while_sampling_and_loses_nothing() -> None:
     house = House(1, 60)
-    wishes, asked_s = [3, 1, 2], 0.0
+    requests_left, asked_s = [3, 1, 2], 0.0
 
     def scale(_: list[int]) -> None:
         nonlocal asked_s
         if not asked_s:
-            house.requests.asked, asked_s = wishes[0], house.paper.now_s
+            house.requests.asked, asked_s = requests_left[0], house.paper.now_s
         assert house.paper.now_s - asked_s <= 5
-        if house.ready == wishes[0] == len(house.pool.state.workers) and len(wishes) > 1:
-            wishes.pop(0)
+        if house.ready == requests_left[0] == len(house.pool.state.workers) and len(requests_left) > 1:
+            requests_left.pop(0)
             asked_s = 0.0
-        elif len(wishes) == 1:
+        elif len(requests_left) == 1:
             asked_s = house.paper.now_s
 
     assert sorted(house.sample(scale)) == list(range(60))
-    assert house.ready == wishes[0] == 2
+    assert house.ready == requests_left[0] == 2
     assert house.ledger.counters["duplicates"] == 0
     assert house.pool.state.counters["crashed"] == 0
 

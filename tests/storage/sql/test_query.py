@@ -128,6 +128,7 @@ def test_length_nesting_and_encoding_are_bounded_before_anything_starts(empty: R
             query(empty, sql, timeout_s=0.0)  # what starts is stopped at once
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "sql",
     [

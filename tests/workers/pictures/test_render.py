@@ -161,6 +161,7 @@ def test_snapshots_stand_side_by_side() -> None:
     assert (sheet[:, :640] != sheet[:, 646:]).any()
 
 
+@pytest.mark.slow
 def test_a_film_has_one_picture_per_row(tmp_path: Path) -> None:
     seen: list[tuple[int, int]] = []
     render(_frames(3), None, tmp_path / "film.mp4", progress=lambda done, total: seen.append((done, total)))
@@ -170,6 +171,7 @@ def test_a_film_has_one_picture_per_row(tmp_path: Path) -> None:
     assert [path.name for path in tmp_path.iterdir()] == ["film.mp4"]
 
 
+@pytest.mark.slow
 def test_a_picture_file_holds_the_middle_row_by_default(tmp_path: Path) -> None:
     frames = _frames(3)
     render(frames, None, tmp_path / "a.png")
