@@ -76,9 +76,9 @@ def load(name: str, folder: Path = FIGURES) -> dict[str, Any]:
 
 
 def cell(value: Any, digits: int = 0, unit: str = "") -> str:
-    """One cell of a table as text: numbers with `digits` after the point and `unit` behind them."""
+    """One cell of a table as text, empty for null: numbers with `digits` after the point and `unit` behind them."""
     if value is None:
-        return "-"
+        return ""
     if isinstance(value, str):
         return value
     if isinstance(value, dict):
@@ -104,11 +104,9 @@ def table(name: str, page: Path) -> str:
         )
         lines.append("| " + " | ".join(cells) + " |")
     link = os.path.relpath(FIGURES / f"{name}.json", page.parent)
-    command = f"`{measurement['command']}`, " if measurement["command"] else ""
-    where = ", ".join(filter(None, (measurement["machine"], measurement["date"])))
-    source = textwrap.fill(
-        f"*{command}{where} ([data]({link})).*", LINE_WIDTH, break_long_words=False, break_on_hyphens=False
-    )
+    command = f"`{measurement['command']}`" if measurement["command"] else None
+    origin = ", ".join(filter(None, (command, measurement["machine"], measurement["date"])))
+    source = textwrap.fill(f"*{origin} ([data]({link})).*", LINE_WIDTH, break_long_words=False, break_on_hyphens=False)
     return "\n".join([*lines, "", source])
 
 

@@ -20,7 +20,7 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 
 UNTRAINED_EPISODES = 60
 THREADS = os.cpu_count()
-"""Of the backward pass; the S-step has two, everything else one."""
+"""Of the backward pass; everything else has one."""
 NOTES = (growth.NOTE,)
 
 

@@ -90,4 +90,7 @@ def test_cells_show_every_digit_that_was_measured(render: ModuleType) -> None:
     assert render.cell({"mean": 0.6, "sd": 0.02}, 3, "m/s") == "0.600 +- 0.020 m/s"
     assert render.cell([0.45, None], 3) == "0.450, (not run)"
     assert render.cell(375000) == "375,000"
-    assert render.cell(None, 3, "%") == "-"
+
+
+def test_what_was_not_measured_is_an_empty_cell(render: ModuleType) -> None:
+    assert render.cell(None, 3, "%") == ""
