@@ -31,6 +31,8 @@ from t6gps.storage.records import PolicySnapshot
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
+EPISODES_PER_CALL_N = 4
+"""A call costs as much as the learner's work on an episode or two."""
 EPISODES_UNDER_WAY_N = 32
 """Episodes on their way to the learner. When it takes no more, sampling waits: the object store is bounded."""
 
@@ -44,10 +46,11 @@ class LearnerActor:
         threads.limit()
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
 
-    def add(self, answer: Answer) -> None:
-        """Take an episode that lies in the object store."""
-        assert answer.packed is not None, "only episodes are streamed"
-        self._learner.add(ipc.unpack(answer.packed, 1)[0])
+    def add(self, *answers: Answer) -> None:
+        """Take episodes that lie in the object store."""
+        for answer in answers:
+            assert answer.packed is not None, "only episodes are streamed"
+            self._learner.add(ipc.unpack(answer.packed, 1)[0])
 
     def add_spooled(self, files: Sequence[Path]) -> None:
         """Take episodes that lie in the spool."""
@@ -87,16 +90,24 @@ class RayLearner:
     def __init__(self, config: Config, node: str, until_done: Callable[[Reference], None]) -> None:
         self.actor = start_actor(LearnerActor, config, where=node)
         self._until_done = until_done
+        self._next: list[Reference] = []
         self._taken: list[Reference] = []
 
     def add(self, reference: Reference) -> None:
-        """Send an episode by its reference in the object store; waits while too many are on their way.
+        """Send an episode by its reference in the object store, a few in a call; waits while too many are on their way.
 
         How it went is asked by `learn`: sampling continues when the learner has died.
         """
-        self._taken.append(self.actor.add.remote(reference))
-        if len(self._taken) > EPISODES_UNDER_WAY_N:
-            self._until_done(self._taken[-EPISODES_UNDER_WAY_N])
+        self._next.append(reference)
+        if len(self._next) == EPISODES_PER_CALL_N:
+            self._send()
+            if len(self._taken) > EPISODES_UNDER_WAY_N // EPISODES_PER_CALL_N:
+                self._until_done(self._taken[-EPISODES_UNDER_WAY_N // EPISODES_PER_CALL_N])
+
+    def _send(self) -> None:
+        if self._next:
+            self._taken.append(self.actor.add.remote(*self._next))
+            self._next.clear()
 
     def add_spooled(self, files: Sequence[Path]) -> None:
         """Let it read episodes from the spool, while others are sampled; `learn` asks how it went."""
@@ -104,6 +115,7 @@ class RayLearner:
 
     def learn(self, phase: Phase) -> Progress:
         """Run a phase; yields (done, total)."""
+        self._send()
         if self._taken:
             self._until_done(self._taken[-1])
             taken, self._taken = self._taken, []

@@ -14,7 +14,7 @@ import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import Any, TextIO
+from typing import Any, BinaryIO
 
 from pydantic import TypeAdapter
 
@@ -33,7 +33,7 @@ class DecisionLog:
     def __init__(self, folder: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         folder.mkdir(exist_ok=True)
         self._path, self._largest_bytes = folder / "decisions.jsonl", largest_bytes
-        self._file: TextIO | None = None
+        self._file: BinaryIO | None = None
 
     def before(self, state: PoolState) -> None:
         """A round begins: where the file does, write the state down."""
@@ -42,15 +42,15 @@ class DecisionLog:
         self.close()
         if self._path.exists():
             self._path.replace(self._path.with_suffix(".1.jsonl"))
-        self._file = self._path.open("w")
-        self._write({"state": _adapter(PoolState).dump_python(state, mode="json")})
+        self._file = self._path.open("wb")
+        self._write(b'{"state":' + _adapter(PoolState).dump_json(state) + b"}")
 
     def after(
         self, state: PoolState, now: float, observed: Sequence[Observation], decided: Sequence[Instruction]
     ) -> None:
         """A round is over."""
         if observed or decided or state.autoscale:
-            self._write({"now": now, "observed": _encode(observed), "decided": _encode(decided)})
+            self._write(b'{"now":%r,"observed":%b,"decided":%b}' % (now, _encode(observed), _encode(decided)))
 
     def close(self) -> None:
         """Close the file."""
@@ -58,9 +58,9 @@ class DecisionLog:
             self._file.close()
             self._file = None
 
-    def _write(self, line: dict[str, Any]) -> None:
+    def _write(self, line: bytes) -> None:
         assert self._file is not None, "`before` opens the file"
-        self._file.write(json.dumps(line, separators=(",", ":")) + "\n")
+        self._file.write(line + b"\n")
         self._file.flush()
 
 
@@ -80,19 +80,21 @@ def replay(path: Path) -> int:
             expected = line["decided"]
         except (ValueError, KeyError, TypeError) as error:
             raise RunError(f"{path}: line {number} is no round of a decision log: {error}") from error
-        decided = json.loads(json.dumps(_encode(decide(state, observed, now))))
+        decided = json.loads(_encode(decide(state, observed, now)))
         if decided != expected:
             raise RunError(f"{path}: line {number} is decided otherwise: logged {expected}, now {decided}")
         rounds_n += 1
     return rounds_n
 
 
-def _encode(sent: Sequence[Observation | Instruction]) -> list[dict[str, Any]]:
-    kinds: list[type] = [type(message) for message in sent]
-    return [
-        {"kind": kind.__name__, **_adapter(kind).dump_python(message, mode="json")}
-        for kind, message in zip(kinds, sent, strict=True)
-    ]
+def _encode(sent: Sequence[Observation | Instruction]) -> bytes:
+    """A JSON list of messages, each with its kind."""
+    return b"[" + b",".join(map(_encode_one, sent)) + b"]"
+
+
+def _encode_one(message: Observation | Instruction) -> bytes:
+    kind: type = type(message)
+    return b'{"kind":"%b",%b' % (kind.__name__.encode(), _adapter(kind).dump_json(message)[1:])
 
 
 def _decode(encoded: dict[str, Any]) -> Any:

@@ -78,27 +78,36 @@ class RayTransport(Transport):
         self._remotes: dict[WorkerId, Remote] = {}
         self._over: SimpleQueue[tuple[Call, Future[Any]]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
+        self._followed = self.policies.source.number
 
     def start(self, worker: WorkerId) -> None:
         actor = start_actor(WorkerActor, cpus=self._cpus)
-        self._begin(worker, Remote(actor), actor.open.remote(self._make_worker, self._settings))
+        self._begin(worker, Remote(actor), actor.open.remote(self._make_worker, self._settings, self.policies.source))
 
     def _begin(self, worker: WorkerId, remote: Remote, opened: Reference) -> None:
         self._remotes[worker] = remote
         self._await(Call(worker, opened))
 
     def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
-        run = self._remotes[worker].actor.run.remote(plan, self.policies.source, self._timings.policy_answer_s)
+        run = self._remotes[worker].actor.run.remote(plan, self._timings.policy_answer_s)
         self._await(Call(worker, run, plan))
 
     def ping(self, worker: WorkerId) -> None:
         self._await(Call(worker, self._remotes[worker].actor.ping.remote()))
+
+    def _follow(self) -> None:
+        """Lead the workers to the policy server when it was replaced."""
+        if self.policies.source.number != self._followed:
+            self._followed = self.policies.source.number
+            for remote in self._remotes.values():
+                remote.actor.follow.remote(self.policies.source)
 
     def _await(self, call: Call) -> None:
         call.reference.future().add_done_callback(lambda future: self._over.put((call, future)))
 
     def poll(self, wait_s: float) -> list[Report]:
         self.policies.watch()
+        self._follow()
         over = []
         try:
             over.append(self._over.get(wait_s > 0, wait_s))
@@ -139,6 +148,7 @@ class RayTransport(Transport):
             result = SharedEpisode(frames, summary, answer.packed, call.reference)
         elif answer.silent_server is not None:
             self.policies.missed(answer.silent_server)
+            self._follow()
         return Done(call.worker, call.plan, result, answer.policy_digest)
 
     def examine(self, worker: WorkerId) -> PostMortem:

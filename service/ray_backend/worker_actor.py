@@ -54,12 +54,13 @@ class WorkerActor:
     def __init__(self) -> None:
         self._process = processes.dump_stacks_on_signal()
         self._worker: Runner | None = None
+        self._source: PolicySource | None = None
         self._snapshot: PolicySnapshot | None = None
         self._digest = ""
 
-    def open(self, make_worker: MakeWorker, settings: RolloutSettings) -> Started:
-        """Make the worker."""
-        self._worker = make_worker(settings)
+    def open(self, make_worker: MakeWorker, settings: RolloutSettings, source: PolicySource) -> Started:
+        """Make the worker, which pulls policies from `source`."""
+        self._worker, self._source = make_worker(settings), source
         threads.limit()
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
         digest = settings_digest(settings.model_dump_json())
@@ -68,14 +69,18 @@ class WorkerActor:
     def ping(self) -> None:
         """A sign of life."""
 
-    def run(self, plan: EpisodePlan, source: PolicySource, patience_s: float) -> Answer:
-        """Run a plan; the policy is pulled from `source`, which has `patience_s` to answer."""
-        if self._worker is None:
+    def follow(self, source: PolicySource) -> None:
+        """Pull policies from another server from now on."""
+        self._source = source
+
+    def run(self, plan: EpisodePlan, patience_s: float) -> Answer:
+        """Run a plan; the policy server has `patience_s` to answer."""
+        if self._worker is None or self._source is None:
             raise RunError("a worker must be opened before it runs plans")
         try:
-            snapshot = self._pulled(plan.policy_version, source, patience_s)
+            snapshot = self._pulled(plan.policy_version, self._source, patience_s)
         except ray.exceptions.RayError:  # the server has died or stalls
-            return self._without_policy(source.number)
+            return self._without_policy(self._source.number)
         if snapshot is None:
             return self._without_policy(None)
         result = attempt(self._worker, plan, snapshot)
