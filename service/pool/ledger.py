@@ -23,7 +23,7 @@ FAILURES_ALLOWED_N, ATTEMPTS_ALLOWED_N = 3, 10
 """An episode is quarantined when it has failed so often, or was tried in vain so often: an attempt that is lost with
 its process or its node counts only as the latter, for ten in a row in the same episode are no accident."""
 HOPELESS_N, HOPELESS_LATER_N = 5, 20
-"""So many quarantined episodes in a row, before and after a first one was committed, mean that nothing works."""
+"""Quarantined episodes in a row that mean that nothing works, before and after a first one was committed."""
 COUNTERS = ("committed", "duplicates", "late", "expired", "given_back", "lost", "failures", "quarantined")
 
 

@@ -110,7 +110,7 @@ def this_node() -> str:
 
 
 def free_workers(cpus_per_worker: float) -> int:
-    """So many more workers find room: what is left on one node is of no use to a worker on another."""
+    """Workers that still find room: what is left on one node is of no use to a worker on another."""
     return sum(int(free / cpus_per_worker + 1e-6) for free in private.free_cpus_by_node())
 
 

@@ -33,7 +33,7 @@ from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import Spool, read
 
 LEARNER_DEATHS_ALLOWED_N = 3
-"""So many in one iteration."""
+"""In one iteration."""
 
 
 class Observer(Protocol):

@@ -19,7 +19,7 @@ AREA_HALF_WIDTH_M = 15.0
 """Waypoints lie within this distance of the origin along x and along y, away from the edge of the ground."""
 
 FAR_WAYPOINT_M = 1000.0
-"""So far that its direction stays the same during an episode."""
+"""Far enough that its direction stays the same during an episode."""
 
 
 def random_waypoints(rng: np.random.Generator, start: Array, settings: TaskSettings) -> Array:
