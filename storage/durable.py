@@ -6,6 +6,8 @@ import os
 import shutil
 from pathlib import Path
 
+_DISCARDED = ".discarded"
+
 
 def sync(path: Path) -> None:
     """Force a file, or the entries of a folder, to disk."""
@@ -33,9 +35,15 @@ def publish(path: Path) -> None:
     sync(path.parent)
 
 
+def sweep(parent: Path) -> None:
+    """Remove what `discard` has left in a folder because it was cut off."""
+    for doomed in parent.glob(f".*{_DISCARDED}"):
+        shutil.rmtree(doomed, ignore_errors=True)
+
+
 def discard(folder: Path) -> None:
     """Remove a folder so that nobody ever sees half of it under its name."""
-    doomed = folder.with_name(f".{folder.name}.discarded")
+    doomed = folder.with_name(f".{folder.name}{_DISCARDED}")
     shutil.rmtree(doomed, ignore_errors=True)
     folder.replace(doomed)
     shutil.rmtree(doomed)

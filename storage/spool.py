@@ -7,6 +7,7 @@ hidden name and then renamed, so that an episode is there whole or not at all.
 from __future__ import annotations
 
 import logging
+from collections.abc import Iterator
 from pathlib import Path
 
 import pyarrow as pa
@@ -75,7 +76,13 @@ class Spool:
 
     def episodes(self) -> dict[int, Episode]:
         """Every whole episode by its number; files that cannot be read are logged and counted in `torn`."""
-        whole: dict[int, Episode] = {}
+        return {episode.episode_id: episode for episode in self._whole()}
+
+    def numbers(self) -> set[int]:
+        """Numbers of the whole episodes, of which none is held."""
+        return {episode.episode_id for episode in self._whole()}
+
+    def _whole(self) -> Iterator[Episode]:
         self.torn = 0
         for path in sorted(self._folder.glob("episode-*.arrow")):
             try:
@@ -84,13 +91,13 @@ class Spool:
                 self.torn += 1
                 _log.warning("%s is torn and will be sampled again: %s", path, error)
                 continue
-            whole[episode.episode_id] = episode
-        return whole
+            yield episode
 
     def clear(self) -> None:
         """Forget the episodes of this iteration, and of earlier ones whose clearing was cut off."""
         for folder in sorted(self._root.glob("iteration-*")):
             if folder.name <= self._folder.name:
                 durable.discard(folder)
+        durable.sweep(self._root)
         self._folder.mkdir()
         durable.sync(self._root)

@@ -92,6 +92,10 @@ class Executor(ABC):
         """Start another learner in the place of one that died; it knows nothing."""
 
     @abstractmethod
+    def tend(self) -> None:
+        """Let the workers be looked after, where whoever calls is at other work for long."""
+
+    @abstractmethod
     def close(self, outcome: RunState = RunState.STOPPING) -> None:
         """Stop every worker and the learner, at once; the run is DONE or STOPPING. A second call does nothing."""
 

@@ -111,7 +111,7 @@ class RayLearner:
 
     def add_spooled(self, files: Sequence[Path]) -> None:
         """Let it read episodes from the spool, while others are sampled; `learn` asks how it went."""
-        self._taken.append(self.actor.add_spooled.remote(files))
+        self._taken.append(self.actor.add_spooled.remote([file.absolute() for file in files]))
 
     def learn(self, phase: Phase) -> Progress:
         """Run a phase; yields (done, total)."""
@@ -145,7 +145,7 @@ class RayLearner:
         self._answer(self.actor.restore.remote(manifest, arrays))
 
     def recall(self, run: Run) -> None:
-        self._answer(self.actor.recall.remote(run))
+        self._answer(self.actor.recall.remote(Run(run.path.absolute())))  # the actor is in another folder
 
     def kill(self) -> None:
         """End its process at once."""

@@ -85,5 +85,8 @@ class SerialExecutor(Executor):
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)
 
+    def tend(self) -> None:
+        """Nothing runs beside the caller here."""
+
     def close(self, outcome: RunState = RunState.STOPPING) -> None:
         self._held.close()

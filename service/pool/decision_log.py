@@ -34,16 +34,18 @@ class DecisionLog:
         folder.mkdir(exist_ok=True)
         self._path, self._largest_bytes = folder / "decisions.jsonl", largest_bytes
         self._file: BinaryIO | None = None
+        self._state_bytes = 0
 
     def before(self, state: PoolState) -> None:
         """A round begins: where the file does, write the state down."""
-        if self._file is not None and self._file.tell() < self._largest_bytes:
+        if self._file is not None and self._file.tell() < max(self._largest_bytes, 2 * self._state_bytes):
             return
         self.close()
         if self._path.exists():
             self._path.replace(self._path.with_suffix(".1.jsonl"))
         self._file = self._path.open("wb")
         self._write(b'{"state":' + _adapter(PoolState).dump_json(state) + b"}")
+        self._state_bytes = self._file.tell()
 
     def after(
         self, state: PoolState, now: float, observed: Sequence[Observation], decided: Sequence[Instruction]
@@ -70,7 +72,7 @@ def replay(path: Path) -> int:
     RunError naming the first round that is decided otherwise, or a line that cannot be read.
     """
     rounds_n, state = 0, None
-    for number, text in enumerate(path.read_text().splitlines(), 1):
+    for number, text in enumerate(path.read_bytes().splitlines(), 1):
         try:
             line = json.loads(text)
             if state is None:

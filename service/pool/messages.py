@@ -12,11 +12,17 @@ from t6gps.storage.records import EpisodePlan
 
 @dataclass(frozen=True)
 class Opened:
-    """A batch of plans begins; `quarantined` ones are not tried, `policy_digests` by version."""
+    """A batch of plans begins.
+
+    quarantined      episodes that are not tried
+    policy_digests   by version
+    worked           an episode of the run was durable before
+    """
 
     plans: tuple[EpisodePlan, ...]
     quarantined: tuple[int, ...]
     policy_digests: Mapping[int, str]
+    worked: bool
 
 
 @dataclass(frozen=True)

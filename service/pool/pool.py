@@ -66,7 +66,7 @@ class Pool:
         """Begin a batch; what comes of other plans than these is late."""
         self._accepted.clear()
         self.phase = "sampling"
-        self._unseen.append(messages.Opened(tuple(plans), tuple(quarantined), policy_digests))
+        self._unseen.append(messages.Opened(tuple(plans), tuple(quarantined), policy_digests, self.state.ledger.worked))
         self._decide()
 
     def sample(self, keep: Callable[[Episode], None]) -> None:
@@ -87,14 +87,14 @@ class Pool:
 
     def close(self, condition: RunState, reason: str) -> None:
         """End every worker and say how the run ended."""
+        if self._log is not None:
+            self._log.close()
         for worker in self.state.workers.values():
             self._transport.kill(worker.id)
         self.state.workers.clear()
         if self.state.condition is not RunState.FAILED:
             self.state.turn(condition, reason)
         self._control.publish(self.status())
-        if self._log is not None:
-            self._log.close()
 
     def wait(self, who: str, whom: str, begins: bool) -> None:
         """Note that somebody begins or ends to wait for somebody."""

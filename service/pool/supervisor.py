@@ -45,6 +45,7 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
         case messages.Opened():
             state.policy_digests = dict(observation.policy_digests)
             state.ledger.open(observation.plans, observation.quarantined)
+            state.ledger.worked = observation.worked
         case messages.Durable():
             state.ledger.commit(observation.episode_id)
         case messages.Capacity():

@@ -7,6 +7,8 @@ queue. A call that never ends - a process that hangs, a node that is cut off - i
 from __future__ import annotations
 
 import logging
+import math
+import time
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
@@ -29,6 +31,8 @@ from t6gps.storage import ipc
 from t6gps.storage.records import Episode, EpisodePlan
 from t6gps.workers.settings import RolloutSettings
 
+SILENT_NODE_S = 5.0
+"""A node whose agent did not answer is not asked again for so long: its workers are lost together."""
 _log = logging.getLogger(__name__)
 
 
@@ -75,6 +79,7 @@ class RayTransport(Transport):
         self._timings = timings
         self._node, self._logs = cluster.this_node(), private.logs_folder()
         self._agents: dict[str, Actor] = {}
+        self._silent_s: dict[str, float] = {}
         self._remotes: dict[WorkerId, Remote] = {}
         self._over: SimpleQueue[tuple[Call, Future[Any]]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
@@ -162,7 +167,8 @@ class RayTransport(Transport):
         return replace(post_mortem, episode_at_fault=post_mortem.episode_at_fault or remote.exited)
 
     def _examine_there(self, process: Process, node: str, died: bool) -> PostMortem:
-        if node in self._agents:
+        silent_s = time.monotonic() - self._silent_s.get(node, -math.inf)
+        if node in self._agents and silent_s > SILENT_NODE_S:
             try:
                 examined = self._agents[node].examine.remote(process, died)
                 post_mortem: PostMortem = ray.get(examined, timeout=self._timings.examine_s)
@@ -170,11 +176,14 @@ class RayTransport(Transport):
             except ray.exceptions.ActorDiedError:
                 del self._agents[node]  # the next worker that is ready there brings another
             except ray.exceptions.RayError as error:
+                self._silent_s[node] = time.monotonic()
                 _log.info("the agent of node %s does not answer: %s", node, type(error).__name__)
         return PostMortem(f"its node does not answer ({node})", episode_at_fault=False)
 
     def kill(self, worker: WorkerId) -> None:
-        remote = self._remotes.pop(worker)
+        remote = self._remotes.pop(worker, None)
+        if remote is None:  # it was to start when something went wrong
+            return
         ray.kill(remote.actor)
         if remote.process is not None and remote.node == self._node:
             processes.kill(remote.process)  # a stopped process does not hear Ray

@@ -15,6 +15,7 @@ from t6gps.service.execution.executor import Executor, Purpose
 from t6gps.service.training.loop import Observer, mean_and_error
 from t6gps.storage import durable
 from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
 
 EVALUATED = {
@@ -79,12 +80,14 @@ def evaluate(
     summaries: dict[int, pa.Table] = {}
 
     def keep(episode: Episode) -> None:
-        summaries[episode.summary["index"][0].as_py()] = episode.summary.take(
-            [0]
-        )  # a copy: the episode's memory is not held
+        copy = episode.summary.take([0])  # the episode's memory is not held
+        summaries[copy["index"][0].as_py()] = copy
         observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
 
     executor.sample(plans, snapshot, keep, Purpose.EVALUATION)
+    if not summaries:
+        where = executor.run.bundles if executor.run else "the log"
+        raise RunError(f"every episode of the evaluation is quarantined; see {where}, mend the cause, then try again")
     return summarise([summaries[index] for index in sorted(summaries)], seed)
 
 

@@ -12,9 +12,10 @@ they have sampled is in the spool when the iteration's turn comes, which then re
 from __future__ import annotations
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any, Protocol, cast
 
 import numpy as np
@@ -90,7 +91,7 @@ class Batch:
 def _batch(config: Config, executor: Executor, spool: Spool) -> Batch:
     plans = seeding.training_plans(config, spool.iteration)
     snapshot = executor.learner.policy(plans[0].policy_version)
-    return Batch(plans, set(spool.episodes()), snapshot)
+    return Batch(plans, spool.numbers(), snapshot)
 
 
 def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, iteration: int) -> None:
@@ -107,6 +108,7 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
             observer.progress(iteration, "sample", len(kept), len(plans))
 
         observer.progress(iteration, "sample", len(kept), len(plans))
+        executor.ledger.worked |= bool(kept)
         executor.feed_spooled([spool.path(number) for number in sorted(kept)])
         executor.sample(batch.missing, batch.snapshot, keep)
         files = [spool.path(number) for number in sorted(kept)]
@@ -121,11 +123,11 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase.name, done, total)
     learned, classes = executor.learner.report()
-    summaries = pa.concat_tables([read(path).summary for path in files]).combine_chunks()
+    summaries = pa.concat_tables([read(path).summary.take([0]) for path in files]).combine_chunks()
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
     row |= _sampled(summaries) | learned | durations
     row["left_out"] = len(plans) - len(files)
-    tables.commit_iteration(run, iteration, map(read, files), row, classes)
+    tables.commit_iteration(run, iteration, _tended(executor, files), row, classes)
     state = executor.learner.state()
     manifest = cast(dict[str, JSON], {**state.manifest, "ledger": executor.ledger.state()})
     checkpoint.save(run.checkpoints, iteration + 1, manifest, state.arrays)
@@ -137,6 +139,13 @@ def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) 
     spool = Spool(run.spool, iteration)
     batch = _batch(config, executor, spool)
     executor.sample_ahead(batch.missing, batch.snapshot, spool.append)
+
+
+def _tended(executor: Executor, files: Sequence[Path]) -> Iterator[Episode]:
+    """Episodes one after the other; the pool is tended meanwhile."""
+    for file in files:
+        executor.tend()
+        yield read(file)
 
 
 @contextmanager

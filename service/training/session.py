@@ -138,5 +138,9 @@ def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BUL
         raise RunError(f"run {run.name} has no checkpoint yet; let it finish an iteration")
     executor = start_executor(config, serial, engine=engine)
     _, manifest, arrays = latest
-    executor.learner.restore(cast(Manifest, manifest), arrays)
+    try:
+        executor.learner.restore(cast(Manifest, manifest), arrays)
+    except BaseException:
+        executor.close()
+        raise
     return executor

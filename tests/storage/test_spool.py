@@ -137,3 +137,14 @@ def test_clearing_forgets_this_and_earlier_iterations_but_no_later_one(tmp_path:
     assert [len(spool.episodes()) for spool in spools] == [0, 0, 1]
     spools[1].append(make_episode(5, 1))
     assert list(spools[1].episodes()) == [5]
+
+
+def test_clearing_removes_what_a_clearing_that_was_cut_off_has_left(tmp_path: Path, make_episode: Any) -> None:
+    spool = Spool(tmp_path, 1)
+    spool.append(make_episode(1, 1))
+    left = tmp_path / ".iteration-000000.discarded"
+    left.mkdir()
+    (left / "episode-000000000000.arrow").write_bytes(b"rest")
+    assert spool.numbers() == {1}
+    spool.clear()
+    assert [path.name for path in tmp_path.iterdir()] == ["iteration-000001"]

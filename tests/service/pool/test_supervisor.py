@@ -496,6 +496,36 @@ def test_a_log_that_has_grown_large_begins_anew_with_the_state_and_is_replayed_f
         assert (tmp_path / name).stat().st_size < 30_000
 
 
+def test_a_log_whose_state_is_larger_than_its_limit_is_a_log_all_the_same(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path, largest_bytes=100)
+    House(2, 60, log=log).sample()
+    log.close()
+    assert replay(tmp_path / "decisions.1.jsonl") > 10
+
+
+def test_what_a_process_said_may_hold_any_character(tmp_path: Path) -> None:
+    log = DecisionLog(tmp_path)
+    house = House(2, 10, log=log)
+
+    def kill(found: list[int]) -> None:
+        if len(found) == 1:
+            house.paper.die(next(iter(house.paper.alive)), "Ended\u2028badly\x85")
+
+    house.sample(kill)
+    log.close()
+    assert replay(tmp_path / "decisions.jsonl") > 10
+
+
+def test_a_resumed_batch_whose_only_missing_episode_fails_does_not_end_the_run() -> None:
+    house = House(2)
+    house.ledger.worked = True  # the others are durable
+    house.paper.raising.add(0)
+    house.pool.open(plans(1), [], {0: "policy"})
+    assert house.sample() == []
+    assert house.ledger.quarantined == {0}
+    assert house.pool.state.condition == "RUNNING"
+
+
 def test_a_log_of_which_a_line_was_changed_is_not_replayed(tmp_path: Path) -> None:
     log = DecisionLog(tmp_path)
     house = House(2, 10, log=log)

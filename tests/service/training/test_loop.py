@@ -16,6 +16,7 @@ from t6gps.service.execution.serial import SerialExecutor
 from t6gps.service.training import evaluation, loop
 from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 
 PHASES_BY_NAME = {phase.name: phase for phase in PHASES}
@@ -180,3 +181,22 @@ def test_an_evaluation_is_noise_free_repeatable_and_kept(tiny: Trained, tmp_path
     assert evaluation.kept(run) is None
     evaluation.keep(run, results[0])
     assert evaluation.kept(run) == results[0]
+
+
+class SamplesNothing(SerialExecutor):
+    """All episodes are quarantined."""
+
+    def sample(
+        self,
+        plans: Sequence[EpisodePlan],
+        snapshot: PolicySnapshot,
+        keep: Keep,
+        purpose: Purpose = Purpose.TRAINING,
+    ) -> None: ...
+
+
+def test_an_evaluation_of_which_every_episode_is_quarantined_says_so(config: Config) -> None:
+    executor = SamplesNothing(config)
+    with pytest.raises(RunError, match="every episode of the evaluation is quarantined"):
+        evaluation.evaluate(config, executor, 3, seed=1, terrain_seed=None, observer=Watcher())
+    executor.close()
