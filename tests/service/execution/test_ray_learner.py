@@ -17,7 +17,7 @@ from t6gps.learner.phases import PHASES
 from t6gps.service import seeding
 from t6gps.service.config import load
 from t6gps.service.execution.ray_executor import RayExecutor
-from t6gps.service.execution.ray_learner import EPISODES_UNDER_WAY_N
+from t6gps.service.execution.ray_learner import EPISODES_PER_CALL_N, EPISODES_UNDER_WAY_N
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.storage.records import Episode
 
@@ -55,7 +55,7 @@ def test_t13_while_the_learner_stands_still_sampling_waits_and_then_ends_with_th
         streamed = executor.learner.policy()
     assert len(kept_s) == len(plans)
     before_n = sum(at_s < resumed_s[0] for at_s in kept_s)
-    assert before_n == EPISODES_UNDER_WAY_N + 1  # one more is being handed over when sampling waits
+    assert before_n == EPISODES_UNDER_WAY_N + EPISODES_PER_CALL_N  # those of one more call, with which sampling waits
 
     serial = SerialExecutor(config)
     with closing(serial):
