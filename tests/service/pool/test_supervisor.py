@@ -2,200 +2,22 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from dataclasses import dataclass, field
 from itertools import pairwise
-from pathlib import Path
 from typing import Any
 
 import pytest
+from paper import EPISODE_S, SHORTEST_S, START_S, House, plans
 
-from t6gps.service.pool.attempt import Failure, FailureKind
-from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import FACTOR, TIMINGS, EpisodeTimes
-from t6gps.service.pool.decision_log import DecisionLog, replay
-from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
-from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
 from t6gps.service.pool.state import (
     LONGEST_BACK_OFF_S,
     NEXT_PHASES,
     NEXT_STATES,
-    Identity,
-    PoolState,
-    WorkerId,
     WorkerPhase,
 )
-from t6gps.service.pool.transport import Done, Report, Transport
 from t6gps.storage.errors import RunError
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
-from t6gps.workers import stub
-
-POLICY = PolicySnapshot(0, (), 1.0, 0.2)
-SETTINGS, START_S, EPISODE_S = "settings", 1.0, 0.5
-SHORTEST_S = TIMINGS.shortest_episode_s
-
-
-def plans(n: int) -> list[EpisodePlan]:
-    return [EpisodePlan(i, 0, i, 100 + i, 4, 0, 0.0, 0.1, 0) for i in range(n)]
-
-
-@dataclass
-class PaperWorker:
-    """A worker on paper: it is ready at a time, and has a queue, as a process has."""
-
-    ready_s: float
-    ready: bool = False
-    queue: list[EpisodePlan] = field(default_factory=list)
-    until_s: float = 0.0
-
-
-class Paper(Transport):
-    """Workers on paper. They do what they are told, but for what is in the sets below."""
-
-    def __init__(self) -> None:
-        self.now_s = 0.0
-        self.room = 100
-        self.alive: dict[WorkerId, PaperWorker] = {}
-        self.starts: list[tuple[int, int, float]] = []
-        self.reports: list[Report] = []
-        self.fails_to_start = False
-        self.settings = SETTINGS
-        self.digest = "policy"
-        self.episode_s = EPISODE_S
-        self.raising: set[int] = set()
-        self.hanging: set[int] = set()
-        self.crashing: set[int] = set()
-        self.silent: set[WorkerId] = set()
-        self.most_in_flight = 0
-        self.polls_n = 0
-
-    def clock(self) -> float:
-        return self.now_s
-
-    def start(self, worker: WorkerId) -> None:
-        self.starts.append((*worker, self.now_s))
-        self.alive[worker] = PaperWorker(self.now_s + START_S)
-
-    def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
-        paper = self.alive.get(worker)
-        if paper is None:  # it has died, which is reported
-            return
-        assert paper.ready
-        if not paper.queue:
-            paper.until_s = self.now_s + self.episode_s
-        paper.queue.append(plan)
-        assert len(paper.queue) <= PLANS_PER_WORKER
-        self.most_in_flight = max(self.most_in_flight, sum(len(each.queue) for each in self.alive.values()))
-
-    def ping(self, worker: WorkerId) -> None:
-        if worker not in self.silent:
-            self.reports.append(Alive(worker))
-
-    def poll(self, wait_s: float) -> list[Report]:
-        self.now_s += wait_s
-        self.polls_n += 1
-        assert self.polls_n < 20_000, "the run does not end"
-        for worker, paper in list(self.alive.items()):
-            if not paper.ready and self.now_s >= paper.ready_s and self.placed(worker):
-                if self.fails_to_start:
-                    self.die(worker)
-                    continue
-                paper.ready = True
-                self.reports.append(Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings)))
-            while paper.queue and self.now_s >= paper.until_s:
-                if paper.queue[0].episode_id in self.hanging:
-                    break
-                if paper.queue[0].episode_id in self.crashing:
-                    self.die(worker)
-                    break
-                plan = paper.queue.pop(0)
-                paper.until_s = self.now_s + self.episode_s
-                result: Episode | Failure = stub.episode(plan, POLICY)
-                if plan.episode_id in self.raising:
-                    result = Failure(FailureKind.RAISED, "PhysicsError", "it fell over", plan.seed, 2)
-                self.reports.append(Done(worker, plan, result, self.digest))
-        reports, self.reports = self.reports, []
-        return reports
-
-    def examine(self, worker: WorkerId) -> PostMortem:
-        return PostMortem(f"stacks of {worker}", "log")
-
-    def kill(self, worker: WorkerId) -> None:
-        self.alive.pop(worker, None)
-        self.reports = [report for report in self.reports if report.worker != worker]
-
-    def placed(self, worker: WorkerId) -> bool:
-        return list(self.alive).index(worker) < self.room
-
-    def free_workers(self) -> int:
-        return max(self.room - len(self.alive), 0)
-
-    def die(self, worker: WorkerId, error: str = "ActorDiedError") -> None:
-        """The process ends; its supervisor hears of it."""
-        del self.alive[worker]
-        self.reports.append(Died(worker, error, "the process ended"))
-
-
-class Requests(Control):
-    """Control without files."""
-
-    def __init__(self) -> None:
-        super().__init__(None, 100)
-        self.asked: int | None = None
-
-    def scale_request(self) -> int | None:
-        asked, self.asked = self.asked, None
-        return asked
-
-
-class House:
-    """A pool of paper workers, with its ledger."""
-
-    def __init__(
-        self,
-        wanted: int,
-        episodes: int = 0,
-        autoscale: tuple[int, int] | None = None,
-        bytes_in_flight: int = 2**30,
-        log: DecisionLog | None = None,
-    ) -> None:
-        self.paper, self.ledger, self.requests = Paper(), Ledger(), Requests()
-        self.quarantined: list[EpisodePlan] = []
-        times = EpisodeTimes(SHORTEST_S)
-        state = PoolState(wanted, SETTINGS, self.ledger, TIMINGS, times, autoscale, bytes_in_flight=bytes_in_flight)
-        self.pool = Pool(state, self.paper, self.requests, self.quarantined.append, log, self.paper.clock)
-        self.pool.open(plans(episodes), [], {0: "policy"})
-
-    def run(self, seconds: float) -> None:
-        """Tick for some time of the paper's clock."""
-        end_s = self.paper.now_s + seconds
-        while self.paper.now_s < end_s:
-            self.pool.tick(0.1)
-
-    def until(self, condition: Any, seconds: float) -> float:
-        """Tick until the condition holds; how long that took on the paper's clock."""
-        start_s = self.paper.now_s
-        while not condition():
-            assert self.paper.now_s - start_s < seconds, self.pool.state.reason
-            self.pool.tick(0.1)
-        return self.paper.now_s - start_s
-
-    @property
-    def ready(self) -> int:
-        return int(self.pool.status()["ready"])
-
-    def sample(self, after_each: Callable[[list[int]], None] = lambda _: None) -> list[int]:
-        """Numbers of the episodes in the order of their arrival; `after_each` sees those that there are so far."""
-        found: list[int] = []
-
-        def keep(episode: Episode) -> None:
-            found.append(episode.episode_id)
-            after_each(found)
-
-        self.pool.sample(keep)
-        return found
+from t6gps.storage.records import EpisodePlan
 
 
 def test_every_planned_episode_arrives_once() -> None:
@@ -452,70 +274,6 @@ def test_a_worker_with_other_settings_or_another_policy_ends_the_run() -> None:
     assert house.ledger.counters["committed"] == 0
 
 
-def test_what_was_decided_under_faults_is_decided_again_from_the_log(tmp_path: Path) -> None:
-    log = DecisionLog(tmp_path)
-    house = House(2, 60, log=log)
-    house.paper.hanging.add(7)
-    house.paper.crashing.add(11)
-    house.paper.raising.add(13)
-
-    def disturb(found: list[int]) -> None:
-        if len(found) == 20:
-            house.requests.asked = 4
-        if len(found) == 40:
-            house.paper.die(next(iter(house.paper.alive)))
-
-    assert sorted(house.sample(disturb)) == [number for number in range(60) if number not in (7, 11, 13)]
-    log.close()
-    assert replay(tmp_path / "decisions.jsonl") > 100
-
-
-def test_a_recorded_failure_is_decided_again() -> None:
-    """Real workers were killed, hung and failed (tests/faults/record.py); today's supervisor decides the same."""
-    recorded = Path(__file__).with_name("recorded_failure.jsonl")
-    assert replay(recorded) > 50
-    text = recorded.read_text()
-    for sign in (
-        '"why":"hung"',
-        '"why":"crashed"',
-        '"episode_at_fault":false',
-        '"kind":"raised"',
-        '"kind":"Quarantine"',
-    ):
-        assert sign in text
-
-
-def test_a_log_that_has_grown_large_begins_anew_with_the_state_and_is_replayed_from_there(tmp_path: Path) -> None:
-    log = DecisionLog(tmp_path, largest_bytes=20_000)
-    house = House(2, 60, autoscale=(1, 3), log=log)
-    house.paper.crashing.add(11)
-    assert len(house.sample()) == 59
-    log.close()
-    for name in ("decisions.jsonl", "decisions.1.jsonl"):
-        assert replay(tmp_path / name) > 0
-        assert (tmp_path / name).stat().st_size < 30_000
-
-
-def test_a_log_whose_state_is_larger_than_its_limit_is_a_log_all_the_same(tmp_path: Path) -> None:
-    log = DecisionLog(tmp_path, largest_bytes=100)
-    House(2, 60, log=log).sample()
-    log.close()
-    assert replay(tmp_path / "decisions.1.jsonl") > 10
-
-
-def test_what_a_process_said_may_hold_any_character(tmp_path: Path) -> None:
-    log = DecisionLog(tmp_path)
-    house = House(2, 10, log=log)
-
-    def kill(found: list[int]) -> None:
-        if len(found) == 1:
-            house.paper.die(next(iter(house.paper.alive)), "Ended\u2028badly\x85")
-
-    house.sample(kill)
-    log.close()
-    assert replay(tmp_path / "decisions.jsonl") > 10
-
-
 def test_a_resumed_batch_whose_only_missing_episode_fails_does_not_end_the_run() -> None:
     house = House(2)
     house.ledger.worked = True  # the others are durable
@@ -524,21 +282,6 @@ def test_a_resumed_batch_whose_only_missing_episode_fails_does_not_end_the_run()
     assert house.sample() == []
     assert house.ledger.quarantined == {0}
     assert house.pool.state.condition == "RUNNING"
-
-
-def test_a_log_of_which_a_line_was_changed_is_not_replayed(tmp_path: Path) -> None:
-    log = DecisionLog(tmp_path)
-    house = House(2, 10, log=log)
-    house.sample()
-    log.close()
-    path = tmp_path / "decisions.jsonl"
-    lines = path.read_text().splitlines()
-    path.write_text("\n".join(lines[:5] + [lines[5].replace('"episode_id":0', '"episode_id":9')] + lines[6:]))
-    with pytest.raises(RunError, match="line 6 is decided otherwise"):
-        replay(path)
-    path.write_text("\n".join(lines[:5] + [lines[5][:20]]))
-    with pytest.raises(RunError, match="line 6 is no round of a decision log"):
-        replay(path)
 
 
 @pytest.mark.parametrize("phases", [NEXT_PHASES, NEXT_STATES], ids=["worker", "run"])
