@@ -4,6 +4,7 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
+SPREAD := -n auto --maxprocesses=4 --dist=loadfile
 ROOMS := storage workers learner service
 
 export OMP_NUM_THREADS = 1
@@ -24,10 +25,10 @@ train: install
 
 # All tests, ten minutes on two cores; then those that need neither Ray nor a trained run, a minute.
 test: install
-	$(BIN)/pytest
+	$(BIN)/pytest $(SPREAD)
 
 test-fast: install
-	$(BIN)/pytest -m "not slow and not ray"
+	$(BIN)/pytest $(SPREAD) -m "not slow and not ray"
 
 # The tree as `t6gps/...`, in links, for tools that do not know how the rooms are mapped into the package.
 view:
