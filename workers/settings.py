@@ -56,7 +56,9 @@ class TerrainSettings(Settings):
     size_m: float = Field(40.0, ge=34.0, le=100.0, description="width of the ground; the plane has no end (m)")
     file: FilePath = Field(None, description="height map (.npy, .png) or surface (.stl, .obj) in place of random hills")
     png_range_m: float = Field(1.55, gt=0.0, le=20.0, description="height between black and white of a .png (m)")
-    accept: tuple[Doubt, ...] = Field((), description="doubts about the file that are accepted: it is meant so")
+    accept: tuple[Doubt, ...] = Field(
+        (), strict=False, description="doubts about the file that are accepted: it is meant so"
+    )
 
 
 class TaskSettings(Settings):

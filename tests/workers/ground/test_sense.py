@@ -7,11 +7,11 @@ import pytest
 
 from t6gps.storage.errors import TerrainError
 from t6gps.workers.ground.draping import drape
+from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.sense import check_extent, check_heights
-from t6gps.workers.ground.surface import load
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.robot.state import Array
-from t6gps.workers.settings import Doubt
+from t6gps.workers.settings import Doubt, TerrainSettings
 
 VERTICES, FACES = generate(4, 1.0, 10.0).triangles()
 SURFACE = VERTICES[FACES]
@@ -95,7 +95,10 @@ def test_an_overhang_is_no_hole_and_upright_walls_do_no_harm() -> None:
 
 
 def test_what_a_file_must_accept_is_a_setting(tmp_path: Path) -> None:
-    np.save(tmp_path / "map.npy", np.zeros((21, 21)))
+    file = str(tmp_path / "map.npy")
+    np.save(file, np.zeros((81, 81)))
     with pytest.raises(TerrainError, match=r"map\.npy: all heights are equal"):
-        load(tmp_path / "map.npy", 10.0, 1.55)
-    assert np.ptp(load(tmp_path / "map.npy", 10.0, 1.55, ("flat",)).heights) == 0
+        ground(TerrainSettings(file=file), 0, 0.0)
+    accepted = ground(TerrainSettings(file=file, accept=("flat",)), 0, 0.0)
+    assert accepted is not None
+    assert np.ptp(accepted.heights[1:-1, 1:-1]) == 0

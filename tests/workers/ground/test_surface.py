@@ -115,6 +115,12 @@ def folder(path: Path) -> Path:
     return path
 
 
+def unreadable(path: Path) -> Path:
+    """A file that exists, for a superuser too, and cannot be read: the first page of memory is never there."""
+    path.symlink_to("/proc/self/mem")
+    return path
+
+
 def pipe(path: Path) -> Path:
     os.mkfifo(path)
     return path
@@ -131,6 +137,7 @@ GREY = (np.add.outer(np.arange(21), np.arange(21)) * 6).astype(np.uint8)
         (lambda d: d / ("x" * 300 + ".npy"), ["File name too long"]),
         (lambda d: d / "nul\0.npy", ["null"]),
         (lambda d: folder(d / "folder.npy"), ["is a folder"]),
+        (lambda d: unreadable(d / "unreadable.npy"), ["Input/output error; give access"]),
         (lambda d: pipe(d / "pipe.npy"), ["a device or a pipe"]),
         (lambda d: sparse(d / "vast.stl", LARGEST_FILE_BYTES + 1), ["more than 16 MiB"]),
         (lambda d: written(d / "empty.npy", b""), ["is empty"]),
