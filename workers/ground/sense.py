@@ -1,4 +1,4 @@
-"""Whether what a file holds makes sense as ground for a robot with bars of 1.95 m.
+"""Whether what a file holds makes sense as ground for a robot with bars of 1.94 m.
 
 What is impossible is refused. What is doubtful is refused too, unless `terrain.accept` names the doubt.
 """
