@@ -1,8 +1,9 @@
 """Mutated files of ground: `python tests/workers/ground/fuzz.py N`, N of each kind, or `make fuzz` with 2,000.
 
 Each file must give finite heights, or one TerrainError of one line that names the file and is not about memory, within
-LONGEST_S. Prints how many gave which answer, the longest time and the largest memory of this process, and exits with 1
-where the law is broken. Files of the same N are the same: everything is drawn from one seed.
+LONGEST_S of processor time, and so must a few whole files at the bounds of what is read. Prints how many gave which
+answer, the longest time and the largest memory of this process, and exits with 1 where the law is broken. Files of the
+same N are the same: everything is drawn from one seed.
 """
 
 from __future__ import annotations
@@ -25,8 +26,11 @@ import trimesh
 from PIL import Image
 
 from t6gps.storage.errors import TerrainError
-from t6gps.workers.ground.surface import load
-from t6gps.workers.ground.terrain import Terrain, generate
+from t6gps.workers.ground.draping import MOST_VISITS_N
+from t6gps.workers.ground.meshes import LARGEST_TEXT_BYTES, MOST_TRIANGLES_N
+from t6gps.workers.ground.sense import FINEST_CELL_M
+from t6gps.workers.ground.surface import LARGEST_FILE_BYTES, load
+from t6gps.workers.ground.terrain import CELL_M, Terrain, generate
 
 Rng = np.random.Generator
 
@@ -166,8 +170,41 @@ def largest_memory_mb() -> float:
     return int(line.split()[1]) / 1000
 
 
+def heaviest() -> dict[str, bytes]:
+    """Files at the bounds of what is read, by name: as many triangles, layers, words, lines and heights as may be."""
+    n = int((MOST_TRIANGLES_N / 2) ** 0.5)
+    many = trimesh.Trimesh(*Terrain(np.zeros((n + 1, n + 1)), SIZE_M / n).triangles(), process=False)
+    facet = b"facet normal 0 0 1\nouter loop\nvertex 0 0 0\nvertex 1 0 0\nvertex 0 1 0\nendloop\nendfacet\n"
+    square = b"v -20 -20 0\nv 20 -20 0\nv 20 20 0\nv -20 20 0\n"
+    layers_n = MOST_VISITS_N // (2 * round(SIZE_M / CELL_M + 1) ** 2)
+    finest = np.zeros((round(SIZE_M / FINEST_CELL_M) + 1,) * 2)
+    return {
+        "triangles.stl": many.export(file_type="stl"),
+        "facets.stl": b"solid\n" + LARGEST_TEXT_BYTES // len(facet) * facet + b"endsolid",
+        "lines.stl": b"solid" + (LARGEST_TEXT_BYTES - 20) * b"\n" + b"endsolid",
+        "words.stl": b"solid\n" + (LARGEST_TEXT_BYTES // 2 - 20) * b"x " + b"\nendsolid",
+        "layers.obj": square + layers_n * b"f 1 2 3 4\n",
+        "faces.obj": square + MOST_TRIANGLES_N * b"f 1 2 3\n",
+        "polygon.obj": square + b"f" + (LARGEST_TEXT_BYTES // 2 - 50) * b" 1",
+        "lines.obj": LARGEST_TEXT_BYTES * b"\n",
+        "vast.stl": (LARGEST_FILE_BYTES + 1) * b"\0",
+        "finest.npy": _saved(lambda file: np.save(file, finest.astype(np.longdouble))),
+        "finest.png": _saved(lambda file: Image.fromarray(finest.astype(np.uint16)).save(file, "PNG")),
+    }
+
+
+def judged(path: Path, content: bytes) -> tuple[str, float, list[str]]:
+    """What a file of this content gives, the processor time (s), and what of that breaks the law."""
+    path.write_bytes(content)
+    start_s = time.process_time()
+    kind, lawful = answer(path)
+    taken_s = time.process_time() - start_s
+    path.unlink()
+    return kind, taken_s, [] if lawful and taken_s < LONGEST_S else [f"{path.name}: {kind}, {taken_s:.1f} s"]
+
+
 def main(files_n: int) -> int:
-    """Read so many mutated files of each kind, print the answers, and return the exit status."""
+    """Read so many mutated files of each kind and the heaviest ones, print the answers, return the exit status."""
     resource.setrlimit(resource.RLIMIT_AS, (2 * 10**9, 2 * 10**9))
     rng = np.random.default_rng(SEED)
     broken, longest_s = [], 0.0
@@ -175,21 +212,21 @@ def main(files_n: int) -> int:
         for suffix, goods in originals().items():
             answers: Counter[str] = Counter()
             for number in range(files_n):
-                path = Path(folder) / f"{number}{suffix}"
-                path.write_bytes(mutated(goods[number % len(goods)], suffix, rng))
-                start = time.perf_counter()
-                kind, lawful = answer(path)
-                taken_s = time.perf_counter() - start
-                longest_s = max(longest_s, taken_s)
+                content = mutated(goods[number % len(goods)], suffix, rng)
+                kind, taken_s, wrong = judged(Path(folder) / f"{number}{suffix}", content)
                 answers[kind] += 1
-                if not lawful or taken_s > LONGEST_S:
-                    broken.append(f"{suffix} number {number}: {kind}, {taken_s:.1f} s")
-                path.unlink()
+                longest_s = max(longest_s, taken_s)
+                broken += wrong
             print(
                 f"{suffix}: {answers['heights']} of {files_n} gave heights, {files_n - answers['heights']} were refused"
             )
             for kind, count in answers.most_common():
                 print(f"{count:8d}  {kind}")
+        for name, content in heaviest().items():
+            kind, taken_s, wrong = judged(Path(folder) / name, content)
+            print(f"{name}, {len(content) / 1e6:.1f} MB: {kind}, {taken_s:.2f} s")
+            longest_s = max(longest_s, taken_s)
+            broken += wrong
     memory_mb = largest_memory_mb()
     print(f"longest {longest_s:.2f} s, largest memory {memory_mb:.0f} MB, {len(broken)} answers against the law")
     print(*broken, sep="\n", end="\n" if broken else "")
