@@ -11,7 +11,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test test-fast view check bench bench-libraries soak clean
+.PHONY: install train test test-fast view check bench bench-libraries fuzz soak clean
 
 install: $(STAMP)
 
@@ -48,6 +48,10 @@ bench: install
 # The service beside Gymnasium's AsyncVectorEnv and RLlib, in the same rounds; ten minutes, JSON on stdout.
 bench-libraries: install
 	@$(BIN)/python tests/libraries/compare.py
+
+# Two thousand mutated files of each kind of ground, a minute: each gives heights or one error, in bounded time and memory.
+fuzz: install
+	$(BIN)/python tests/workers/ground/fuzz.py 2000
 
 # Twenty kills, a learner that pauses for a minute, and half an hour of workers killed, stopped and scaled at random;
 # the figures are printed at the end.

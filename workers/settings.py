@@ -1,6 +1,6 @@
 """Settings of the robot, its ground and its task. Defaults are SUPERball v2 with the paper's scenario."""
 
-from typing import Annotated
+from typing import Annotated, Literal
 
 from pydantic import BeforeValidator, Field, model_validator
 
@@ -16,6 +16,9 @@ def _none_for(old: int | str) -> BeforeValidator:
 
 
 FilePath = Annotated[str | None, _none_for("")]
+Doubt = Literal["extent", "range", "step", "flat"]
+"""What is doubtful about a ground's file (`workers.ground.sense`, docs/physics.md)."""
+
 Directions = Annotated[Annotated[int, Field(ge=1, le=360)] | None, _none_for(0)]
 
 
@@ -53,6 +56,9 @@ class TerrainSettings(Settings):
     size_m: float = Field(40.0, ge=34.0, le=100.0, description="width of the ground; the plane has no end (m)")
     file: FilePath = Field(None, description="height map (.npy, .png) or surface (.stl, .obj) in place of random hills")
     png_range_m: float = Field(1.55, gt=0.0, le=20.0, description="height between black and white of a .png (m)")
+    accept: tuple[Doubt, ...] = Field(
+        (), strict=False, description="doubts about the file that are accepted: it is meant so"
+    )
 
 
 class TaskSettings(Settings):

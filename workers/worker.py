@@ -14,7 +14,7 @@ from t6gps.workers.episode.recording import Record
 from t6gps.workers.episode.rollout import rollout
 from t6gps.workers.episode.stance import check_stance
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
-from t6gps.workers.physics.engine import Engine
+from t6gps.workers.physics.engine import Engine, Unique
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings
 
@@ -25,7 +25,7 @@ RANDOMISATION_STREAM = 3
 """Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
 
 
-class RolloutWorker:
+class RolloutWorker(Unique):
     """Runs episodes one after the other; each depends on its plan and policy alone.
 
     `engine` makes the simulator of a robot: PyBullet, or another engine. Raises PhysicsError for a robot that cannot

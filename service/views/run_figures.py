@@ -186,6 +186,8 @@ def _track(frames: pa.Table, episode_id: int) -> tuple[Array, Array]:
 def contours(figure: Figure, axes: Axes, terrain: Terrain, low: Array, high: Array) -> None:
     x, y = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[1], high[1], 200))
     heights = terrain.height(x, y)
+    if np.ptp(heights) == 0:  # level where the robot went, though perhaps not elsewhere
+        return
     levels = np.linspace(heights.min(), heights.max(), 9)
     # Half of the colours, the light ones: tracks and labels must stay readable on the lowest ground.
     darkest = levels[0] - (levels[-1] - levels[0]) / 2

@@ -1,10 +1,12 @@
 """Laws of the Gymnasium environment: the same episode as the rollout's, through the interface that everyone knows."""
 
+import copy
+import pickle
 import re
 import subprocess
 import sys
 import warnings
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +17,7 @@ from gymnasium.utils.env_checker import check_env
 from numpy.typing import NDArray
 
 from t6gps.storage import schema
-from t6gps.storage.errors import DataError
+from t6gps.storage.errors import ConfigError, DataError, PhysicsError
 from t6gps.storage.records import EpisodePlan, PolicySnapshot
 from t6gps.workers.environment import ENVIRONMENT_ID, EPISODE_STEPS, SuperBallEnvironment
 from t6gps.workers.robot.neutral import nominal_rest_length
@@ -207,6 +209,82 @@ def test_unknown_options_and_difficulties_are_refused(environment: SuperBallEnvi
         SuperBallEnvironment(terrain=TerrainSettings(difficulty=1.6))
 
 
+@pytest.mark.parametrize("value", [1.9, -1, True, np.True_, "3", [1]])
+@pytest.mark.parametrize("name", ["seed", "terrain_seed"])
+def test_a_seed_is_a_whole_number_or_refused(environment: SuperBallEnvironment, name: str, value: Any) -> None:
+    with pytest.raises(DataError, match=f"{name} must be a whole number from 0 on, found") as error:
+        environment.reset(seed=value) if name == "seed" else environment.reset(options={name: value})
+    assert repr(value) in str(error.value)
+
+
+def test_seeds_of_numpy_are_those_of_python(environment: SuperBallEnvironment) -> None:
+    _, info = environment.reset(seed=np.int64(3), options={"terrain_seed": np.uint8(4)})  # type: ignore[arg-type]
+    assert (info["seed"], info["terrain_seed"]) == (3, 4)
+    with pytest.raises(DataError, match="are a mapping"):
+        environment.reset(options=[4])  # type: ignore[arg-type]
+
+
+@pytest.mark.parametrize(
+    ("copied", "wrapped"),
+    [(copy.copy, False), (copy.deepcopy, False), (copy.deepcopy, True), (pickle.dumps, False), (pickle.dumps, True)],
+)
+def test_an_environment_cannot_be_copied(copied: Callable[[object], object], wrapped: bool) -> None:
+    """A copy would move the robot of the original, and closing one would close the other."""
+    made = gymnasium.make(ENVIRONMENT_ID)
+    twin = gymnasium.make(ENVIRONMENT_ID)
+    observation, _ = made.reset(seed=3)
+    with pytest.raises(PhysicsError, match="SuperBallEnvironment cannot be copied or pickled"):
+        copied(made if wrapped else made.unwrapped)
+    twin.reset(seed=3)
+    action = np.zeros(24, np.float32)
+    assert np.array_equal(made.step(action)[0], twin.step(action)[0])
+    assert not np.array_equal(observation, made.step(action)[0])
+    made.close()
+    twin.close()
+
+
+def test_a_closed_environment_says_so() -> None:
+    environment = SuperBallEnvironment()
+    environment.reset(seed=0)
+    environment.close()
+    environment.close()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed; make another one"):
+        environment.reset()
+    with pytest.raises(gymnasium.error.ClosedEnvironmentError, match="closed; make another one"):
+        environment.step(np.zeros(24, np.float32))
+
+
+def test_plain_settings_pass_through_json_and_make_the_same_environment() -> None:
+    settings = {"robot": {"friction": 0.7}, "task": {"waypoints": 3}, "terrain": {"difficulty": 0.5}}
+    made = gymnasium.make(ENVIRONMENT_ID, **settings)  # type: ignore[arg-type]
+    assert made.spec is not None
+    again = gymnasium.make(gymnasium.envs.registration.EnvSpec.from_json(made.spec.to_json()))
+    groups = SuperBallEnvironment(
+        RobotSettings(friction=0.7), TaskSettings(waypoints=3), TerrainSettings(difficulty=0.5)
+    )
+    rows = [trajectory(environment, 5)[0] for environment in (made.unwrapped, again.unwrapped, groups)]
+    assert np.array_equal(rows[0], rows[1])
+    assert np.array_equal(rows[0], rows[2])
+    for environment in (made, again, groups):
+        environment.close()
+
+
+@pytest.mark.parametrize(
+    ("settings", "words"),
+    [
+        ({"terrain": {"rough": 1}}, "unknown key terrain.rough; allowed in terrain: difficulty, tilt_deg"),
+        ({"terrain": {"difficulty": 3}}, "terrain.difficulty: must be less than or equal to 1.5, found 3"),
+        ({"robot": {"friction": np.ones(2)}}, "robot: Object of type ndarray is not JSON serializable; use plain"),
+        ({"task": 3}, "task must be TaskSettings or a mapping, found 3"),
+        ({"terrain": RobotSettings()}, "terrain must be TerrainSettings or a mapping, found RobotSettings"),
+        ({"terrain": {"difficulty": 1.0}, "task": {"directions": 3}}, "starts from rest on flat ground"),
+    ],
+)
+def test_settings_that_are_none_are_refused_with_what_is_allowed(settings: dict[str, Any], words: str) -> None:
+    with pytest.raises(ConfigError, match=re.escape(words)):
+        SuperBallEnvironment(**settings)
+
+
 @pytest.mark.slow
 @pytest.mark.parametrize("context", ["fork", "spawn"])
 def test_environments_in_processes_do_what_single_ones_do(environment: SuperBallEnvironment, context: str) -> None:
@@ -221,7 +299,7 @@ def test_environments_in_processes_do_what_single_ones_do(environment: SuperBall
 
 def test_the_examples_of_the_page_run_as_they_stand(capsys: pytest.CaptureFixture[str]) -> None:
     examples = re.findall(r"```python\n(.*?)```", PAGE.read_text(), re.DOTALL)
-    assert len(examples) == 2
+    assert len(examples) == 3
     for example in examples:
         exec(compile(example, str(PAGE), "exec"), {"__name__": "__example__"})
     assert "return" in capsys.readouterr().out

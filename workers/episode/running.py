@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from t6gps.workers.episode.start import random_start, rest_start
 from t6gps.workers.episode.task import Course, one_direction, random_waypoints
 from t6gps.workers.ground.ground import ground
-from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
+from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine, Unique
 from t6gps.workers.physics.observer import observe, survey
 from t6gps.workers.robot.support import SupportFrame, enter
 from t6gps.workers.settings import RolloutSettings
@@ -20,7 +20,7 @@ SENSOR_STREAM = 4
 """Branch of an episode's seed; start, course and exploration come first, then the robot (`worker`)."""
 
 
-class RunningEpisode:
+class RunningEpisode(Unique):
     """The robot on its way; it depends on the arguments and the commands alone, whatever the engine did before.
 
     state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame

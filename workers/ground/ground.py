@@ -6,6 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
+from t6gps.workers.ground.surface import load
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.settings import TerrainSettings
 
@@ -16,9 +17,7 @@ FENCE_HEIGHT_M = 2.0
 def ground(settings: TerrainSettings, seed: int, difficulty: float) -> Terrain | None:
     """Ground of an episode, None for the endless plane. Raises TerrainError as `generate` and `surface.load`."""
     if settings.file is not None:
-        from t6gps.workers.ground.surface import load  # trimesh takes most of a second to load
-
-        terrain = load(Path(settings.file), settings.size_m, settings.png_range_m)
+        terrain = load(Path(settings.file), settings.size_m, settings.png_range_m, settings.accept)
     elif difficulty > 0 or settings.tilt_deg > 0:
         terrain = generate(seed, difficulty, settings.size_m)
     else:

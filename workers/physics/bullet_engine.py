@@ -52,7 +52,7 @@ class PyBulletEngine(Engine):
 
     `stepper` is one of STEPPERS; by default the environment variable T6GPS_PHYSICS decides, else "plugin". `client` and
     `bodies` are PyBullet's numbers of the client and of the six bars. Raises PhysicsError if the physics cannot be
-    started.
+    started, and wherever an engine is used that was closed: its number may be another one's by then.
     """
 
     def __init__(self, robot: RobotSettings, stepper: str | None = None) -> None:
@@ -67,8 +67,8 @@ class PyBulletEngine(Engine):
         self.robot = robot
         self.bodies: list[int] = []
         self._terrain: Terrain | None = None
-        self.client = pybullet.connect(pybullet.DIRECT)
-        if self.client < 0:
+        self._client = pybullet.connect(pybullet.DIRECT)
+        if self._client < 0:
             raise PhysicsError("PyBullet cannot open another client; close simulations that are no longer used")
         try:
             self._stepper = STEPPERS[name](self.client, robot, steps_n)
@@ -77,15 +77,26 @@ class PyBulletEngine(Engine):
             self.close()
             raise
 
+    @property
+    def client(self) -> int:
+        """PyBullet's number of the client. PhysicsError if it was closed."""
+        self._check_open()
+        return self._client
+
+    def _check_open(self) -> None:
+        if self._client < 0:
+            raise PhysicsError("the engine was closed, and its simulator with it; make a new one")
+
     def set_ground(self, terrain: Terrain | None) -> None:
         """Replace the ground, None being the plane z = 0, and put the robot into its neutral state.
 
         The whole world is rebuilt: what Bullet computes depends on the order in which bodies were made. A plane in
         place of a plane is the same world.
         """
+        client = self.client
         if not self.bodies or terrain is not None or self._terrain is not None:
             self._terrain = terrain
-            self.bodies = build_world(self.client, self.robot, terrain)
+            self.bodies = build_world(client, self.robot, terrain)
         self.reset(neutral_state(self.robot))
 
     def reset(self, state: RobotState) -> None:
@@ -100,15 +111,16 @@ class PyBulletEngine(Engine):
     def control_step(self, command: Array) -> RobotState:
         """The state 0.1 s later, as `Engine.control_step` describes it."""
         within = clipped(command, self.robot)
+        self._check_open()
         self._state = self._stepper.control_step(self.bodies, self._state.rest_lengths, within)
         check_sound(self._state, self._terrain)
         return self._state
 
     def close(self) -> None:
         """Close the client; a second call does nothing."""
-        if self.client >= 0:
-            pybullet.disconnect(physicsClientId=self.client)
-            self.client = -1
+        if self._client >= 0:
+            pybullet.disconnect(physicsClientId=self._client)
+            self._client = -1
 
 
 def _check_bare() -> None:

@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from typing import Self
+from typing import NoReturn, Self
 
+from t6gps.storage.errors import PhysicsError
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.settings import RobotSettings
@@ -16,7 +17,22 @@ GRAVITY_M_PER_S2 = 9.81
 """Standard gravity."""
 
 
-class Engine(ABC):
+class Unique:
+    """Base of whatever leads to a simulator outside Python: it can be neither copied nor pickled.
+
+    A copy would move the same simulator, and closing the copy would close the original's.
+    """
+
+    def __reduce__(self) -> NoReturn:
+        """Refuse what `copy.copy`, `copy.deepcopy` and `pickle` ask for, by PhysicsError."""
+        name = type(self).__name__
+        raise PhysicsError(
+            f"{name} cannot be copied or pickled: the copy would move the simulator of the original; make a second "
+            f"{name} from the same settings"
+        )
+
+
+class Engine(Unique, ABC):
     """The robot with the settings `robot` on its ground. Several engines may live in one process.
 
     Leaving the context of an engine closes it.

@@ -11,7 +11,7 @@ import numpy as np
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.physics.cables import loads, move_winches
-from t6gps.workers.physics.engine import Engine
+from t6gps.workers.physics.engine import Engine, Unique
 from t6gps.workers.physics.limits import check_sound, clipped, physics_steps_n
 from t6gps.workers.physics.mjcf import to_mjcf
 from t6gps.workers.robot.neutral import neutral_state
@@ -27,7 +27,7 @@ except ImportError:
 __all__ = ["MujocoEngine", "MujocoStepper", "mujoco"]
 
 
-class MujocoStepper:
+class MujocoStepper(Unique):
     """A MuJoCo model of the robot on its ground, and its data, stepped under the plain law of the cables."""
 
     def __init__(self, robot: RobotSettings, terrain: Terrain | None) -> None:

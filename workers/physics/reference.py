@@ -5,11 +5,12 @@ from __future__ import annotations
 from t6gps.workers.physics.bullet import pybullet
 from t6gps.workers.physics.bullet_world import apply_loads, read_state
 from t6gps.workers.physics.cables import move_winches
+from t6gps.workers.physics.engine import Unique
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.settings import RobotSettings
 
 
-class ReferenceStepper:
+class ReferenceStepper(Unique):
     """Steps a client as the plugin does, to the last bit."""
 
     def __init__(self, client: int, robot: RobotSettings, steps_n: int) -> None:

@@ -16,6 +16,7 @@ from matplotlib.patches import Circle
 from t6gps.service.views import run_figures
 from t6gps.storage import catalog, schema, tables
 from t6gps.workers.episode.task import WAYPOINT_RADIUS_M
+from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
 from t6gps.workers.robot.topology import DELTA, FACES
 from t6gps.workers.settings import TerrainSettings
@@ -92,6 +93,16 @@ def test_the_ground_track_shows_the_episode_of_median_speed(difficulty: float) -
     circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
     assert [circle.center for circle in circles] == [(0, 2), (4, 3), (2, 3)]
     assert {circle.radius for circle in circles} == {WAYPOINT_RADIUS_M}
+
+
+def test_ground_that_is_level_where_the_robot_went_has_no_contours() -> None:
+    terrain, low, high = Terrain(np.diag(np.full(21, 1.0)), 0.5), np.array([-4.0, 2.0]), np.array([-2.0, 4.0])
+    figure = Figure()
+    axes = figure.subplots()
+    run_figures.contours(figure, axes, terrain, low, high)
+    assert not axes.collections
+    run_figures.contours(figure, axes, terrain, low, -low)
+    assert axes.collections
 
 
 def test_segments_are_drawn_about_the_centre_of_their_triangle_in_the_colour_of_their_class() -> None:

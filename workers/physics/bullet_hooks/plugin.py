@@ -9,6 +9,7 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.engine import Unique
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS_N, CABLES, CABLES_N
 from t6gps.workers.settings import RobotSettings
@@ -51,7 +52,7 @@ def library_path(folder: Path = Path(__file__).parent) -> Path:
     raise PhysicsError(f"the physics plugin {candidates[0].name} is not built; {_REMEDY}")
 
 
-class PluginStepper:
+class PluginStepper(Unique):
     """Steps a client by one call per control step; the numbers are exchanged in one block of memory.
 
     Bullet's functions are looked up in `bullet_library`, which the process must have loaded.
