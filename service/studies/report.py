@@ -61,7 +61,10 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
 
 
 def run_rows(finished: Sequence[Finished]) -> list[Row]:
-    """One row per run: its arm and seed, what it sampled, and its evaluation."""
+    """One row per run: its arm and seed, the steps that it sampled, and its evaluation.
+
+    The steps of a baseline are those that it was allowed.
+    """
     rows = []
     for outcome in finished:
         iterations = tables.read(outcome.run, "iterations").sort_by("iteration").to_pylist()
@@ -71,7 +74,7 @@ def run_rows(finished: Sequence[Finished]) -> list[Row]:
                 "run": outcome.run.name,
                 "arm": outcome.trial.arm,
                 "seed": outcome.trial.seed,
-                "steps": outcome.trial.training_steps,
+                "steps": sum(row["steps"] for row in iterations) if iterations else outcome.trial.training_steps,
                 **evaluated,
                 "modes": iterations[-1]["modes"] if iterations else None,
                 "learning_s": sum(row[key] for row in iterations for key in DURATIONS) if iterations else None,
@@ -88,7 +91,8 @@ def arm_rows(finished: Sequence[Finished]) -> list[Row]:
     result = []
     for arm in dict.fromkeys(row["arm"] for row in rows):
         seeds = [row for row in rows if row["arm"] == arm]
-        summary: Row = {"arm": arm, "seeds": len(seeds), "steps": seeds[0]["steps"]}
+        summary: Row = {"arm": arm, "seeds": len(seeds)}
+        summary["steps"] = round(np.mean([row["steps"] for row in seeds]))
         summary |= spread_of(seeds)
         for key in ("modes", "learning_s", "wall_s"):
             known = [row[key] for row in seeds if row[key] is not None]
