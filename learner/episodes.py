@@ -6,7 +6,7 @@ of it is kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from typing import Protocol
 
 import numpy as np
@@ -53,14 +53,19 @@ class Episodes:
     def __contains__(self, episode_id: int) -> bool:
         return episode_id in self._pieces
 
-    def add(self, episode_id: int, frames: pa.Table) -> None:
-        """Take an episode that is not among them. DataError when its record is inconsistent."""
+    def add(self, episode_id: int, frames: pa.Table, constants: Mapping[str, float] | None = None) -> None:
+        """Take an episode that is not among them. DataError when its record is inconsistent.
+
+        constants   further columns, by the value that all rows of the episode have
+        """
         columns: Columns = {}
         try:
             for reading in self._readings:
                 columns |= reading.read(frames)
         except DataError as error:
             raise DataError(f"episode {episode_id}: {error}") from error
+        for name, value in (constants or {}).items():
+            columns[name] = np.full(frames.num_rows, value, dtype=np.float32)
         pieces = cut(columns["starts"], columns["acts"], self._longest_segment_steps)
         for name, values in columns.items():
             self._columns.setdefault(name, _Blocks()).append(values)

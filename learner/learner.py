@@ -1,6 +1,6 @@
 """One iteration of T6-GPS after sampling (paper Algorithm 2, lines 3 to 13), the only stateful part of the learner.
 
-learner.add(frames)                     once per episode, in any order
+learner.add(frames, noise_std_m)        once per episode, in any order
 for done, total in learner.segment():   ...         each phase reports its progress while it runs
 for done, total in learner.fit():       ...
 for done, total in learner.backward_pass(): ...
@@ -27,15 +27,16 @@ from t6gps.learner.algorithm.segments import classify, group
 from t6gps.learner.alternatives import localization, mixtures, standard_gps
 from t6gps.learner.checkpoint import Carried
 from t6gps.learner.episodes import Episodes, Reading, RowReading
+from t6gps.learner.exploration import exploration
 from t6gps.learner.improvers import improver, transitions
-from t6gps.learner.improvers.action_value import REMEMBERED_N, ActionValue
+from t6gps.learner.improvers.action_value import ActionValue
 from t6gps.learner.improvers.by_action_value import ByActionValue
 from t6gps.learner.improvers.by_backward_pass import ByBackwardPass
 from t6gps.learner.improvers.improver import Improved, Improver, Surrogate
 from t6gps.learner.phases import PHASES
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.report import Fitted, Iteration, Segmented, Trained, kl, report
-from t6gps.learner.rows import AnyArray, Flags, Floats, Ints, Rows, pieces, root_mean_square
+from t6gps.learner.rows import AnyArray, Flags, Floats, Ints, Rows, pieces
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.learner.streams import Stream, branch, generator
 from t6gps.storage import schema, tables
@@ -88,16 +89,16 @@ class Learner:
         self._cost_weights = target_speed_m_per_s, vertical_weight
         self._command_range_m, self._reach_m = command_range_m, reach_m
         sizes = SEEN_N[settings.observation], world_labels.shape[1], settings.hidden_layers
-        rng = self._rng(0, Stream.UNTRAINED)
-        untrained = policy.initial(*sizes, rng, offset_m=offset_m, scale_m=scale_m)
+        untrained = policy.initial(*sizes, self._rng(0, Stream.UNTRAINED), offset_m=offset_m, scale_m=scale_m)
         self._carried = Carried(untrained, settings.replay_iterations, keeps_earlier)
         self._value: ActionValue | None = None
         if settings.value_from:
-            self._value = ActionValue(*self._cost_weights, self._rng(0, Stream.ACTION_VALUE))
+            first = self._rng(0, Stream.ACTION_VALUE)
+            self._value = ActionValue(settings.action_value, *self._cost_weights, first)
         in_world = settings.localization is Localization.TIME
         self._rows: RowReading = standard_gps.InWorld(world_labels) if in_world else Canonical(settings.reduced_state)
         self._motion = transitions.Motion(mirrored)
-        readings: list[Reading] = [self._rows, self._motion] if self._value else [self._rows]
+        readings: list[Reading] = [self._rows, *([self._motion] if self._value else [])]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
         self._done = _Done()
 
@@ -113,15 +114,15 @@ class Learner:
         """The policy of a version, the newest by default. Raises RunError when it is not kept."""
         return self._carried.policy(version)
 
-    def add(self, frames: pa.Table) -> None:
-        """Take one episode of the iteration: check it, copy what is needed, and cut it into segments (line 3).
+    def add(self, frames: pa.Table, noise_std_m: float) -> None:
+        """Take an episode planned with this noise per cable (m): check it, copy what is needed, cut it (line 3).
 
         Raises DataError when the learner already has it, or when its record is inconsistent.
         """
         episode_id = int(frames.column("episode_id")[0].as_py())
         if episode_id in self._episodes:
             raise DataError(f"episode {episode_id} was added twice in iteration {self.snapshot.version}")
-        self._episodes.add(episode_id, frames)
+        self._episodes.add(episode_id, frames, {"noise_std_m": noise_std_m})
 
     def segment(self) -> Progress:
         """Join the segments of all episodes and classify them (lines 3 to 5)."""
@@ -198,8 +199,8 @@ class Learner:
         """Read from a run's tables what the next iteration depends on beside `state()`: earlier transitions."""
         if self._value is None:
             return
-        newest = self.snapshot.version
-        for iteration in range(max(newest - REMEMBERED_N + 1, 0), newest):
+        newest, remembered_n = self.snapshot.version, self._settings.action_value.remembered_iterations
+        for iteration in range(max(newest - remembered_n + 1, 0), newest):
             episodes = tables.frames_of(run, iteration, transitions.COLUMNS)
             self._value.add(transitions.recalled(episodes, self._motion, self._reach_m))
             self._value.file_away()
@@ -234,12 +235,11 @@ def _plans(
 
 
 def _divergence(snapshot: PolicySnapshot, rows: Rows, seen: Floats, command_range_m: tuple[float, float]) -> Floats:
-    """KL divergence of a policy from the one that acted [n] (nat), both with the noise that was explored with."""
-    acting, divergence = np.flatnonzero(rows.acts), np.empty(len(rows.acts), dtype=np.float32)
-    variance = root_mean_square(acting, lambda part: rows.action[part] - rows.action_mean[part]) ** 2
+    """KL divergence of a policy from the one that acted [n] (nat), both with the noise of the row's episode."""
+    explored, divergence = exploration(rows, rows.acts), np.empty(len(rows.acts), dtype=np.float32)
     for part in pieces(np.arange(len(rows.acts))):
         mean = np.clip(policy.act(snapshot, seen[part]), *command_range_m)
         if rows.labels is not None:
             mean = standard_gps.to_world(mean, rows.labels[part])
-        divergence[part] = kl(rows, part, mean, variance)
+        divergence[part] = kl(rows, part, mean, explored)
     return divergence

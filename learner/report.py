@@ -13,6 +13,7 @@ from t6gps.learner.algorithm.backward_pass import ACTION_VARIANCE_FLOOR_M2
 from t6gps.learner.algorithm.local_models import ClassModel
 from t6gps.learner.algorithm.model_series import ModelSeries
 from t6gps.learner.algorithm.segments import ClassKey, SegmentGroup, Segments
+from t6gps.learner.exploration import Exploration
 from t6gps.learner.improvers.improver import Improved
 from t6gps.learner.port import Report, Row
 from t6gps.learner.rows import NONE, Floats, Ints, Rows, pieces, root_mean_square
@@ -67,13 +68,14 @@ def report(
     return Report(_iteration_row(results, command_range_m), [{"iteration": iteration, **row} for row in classes])
 
 
-def kl(rows: Rows, part: Ints, action_mean: Floats, exploration_variance_m2: float) -> Floats:
+def kl(rows: Rows, part: Ints, action_mean: Floats, explored: Exploration) -> Floats:
     """KL divergence at rows [m] of a policy with noise-free commands [m, nu] from the one that acted [m] (nat).
 
-    Both have the exploration variance.
+    Both have the exploration noise of the row's episode.
     """
     change = action_mean - rows.action_mean[part]
-    divergence: Floats = np.square(change).sum(axis=1) / (2 * max(exploration_variance_m2, ACTION_VARIANCE_FLOOR_M2))
+    variance_m2 = np.maximum(explored.variance_m2, ACTION_VARIANCE_FLOOR_M2).astype(np.float32)
+    divergence: Floats = np.square(change).sum(axis=1) / (2 * variance_m2[explored.level[part]])
     return divergence
 
 
@@ -132,8 +134,8 @@ def _class_row(results: Iteration, cost_after: NDArray[np.floating], number: int
         "rows": int(lengths[members].sum()),
         "time_steps": warping.class_steps(lengths[group.segments], group.key.exit != NONE),
         "pooled": group.pooled,
-        "modes": float(fit.modes[fit.modes > 0].mean()) if fit else 0.0,
-        "residual": _mean(results.fitted.series.residual[sampled]) if sampled.any() else 0.0,
+        "modes": float(fit.modes[fit.modes > 0].mean()) if fit else None,
+        "residual": _mean(results.fitted.series.residual[sampled]) if sampled.any() else None,
         "cost": _mean(cost_after[within]),
         "predicted_cost_change": _mean(change) if sampled.any() else None,
         "policy_kl": _mean(results.trained.kl[within]),

@@ -42,6 +42,7 @@ class Rows:
     action_mean   the same without exploration noise (m)
     target        horizontal unit vector to the waypoint [n, 2]
     observation   what the policy saw [n, ny]
+    noise_std_m   exploration noise that the episode was planned with [n]
     kind, entry, exit   of the support triangle [n], NONE for a null edge
     starts        the row is the first one on its support triangle [n]
     acts          the row has an action [n]
@@ -55,6 +56,7 @@ class Rows:
     action_mean: Floats
     target: Floats
     observation: Floats
+    noise_std_m: Floats
     kind: Ints
     entry: Ints
     exit: Ints

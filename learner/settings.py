@@ -33,6 +33,29 @@ class ModeSearch(StrEnum):
 Observation = Literal["sensors", "shape"]
 ReducedState = Literal["com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables"]
 LayerWidth = Annotated[int, Field(ge=1, le=4096)]
+HiddenLayers = Annotated[tuple[LayerWidth, ...], Field(strict=False, min_length=1, max_length=8)]
+
+
+class ActionValueSettings(Settings):
+    """The learned action value Q, and how actions climb it (docs/algorithm.md, "Action value")."""
+
+    remembered_iterations: int = Field(3, ge=1, le=20, description="iterations whose transitions are learned from")
+    discount: float = Field(0.95, ge=0.0, lt=1.0, description="gamma, per control step of 0.1 s")
+    hidden_layers: HiddenLayers = Field((128, 128), description="tanh units per hidden layer of Q")
+    batch: int = Field(256, ge=1, le=100_000, description="transitions per gradient step")
+    steps: int = Field(600, ge=1, le=1_000_000, description="gradient steps per iteration")
+    first_steps: int = Field(1800, ge=1, le=1_000_000, description="gradient steps of the first iteration")
+    learning_rate: float = Field(1e-3, gt=0.0, le=1.0, description="step of AdamW")
+    weight_decay: float = Field(0.01, ge=0.0, le=1.0, description="share of the weights that AdamW takes off, per rate")
+    target_rate: float = Field(0.005, gt=0.0, le=1.0, description="share by which the target follows Q, per step")
+    own_heading_share: float = Field(
+        0.5, ge=0.0, le=1.0, description="share of transitions learned from with their own waypoint's direction"
+    )
+    step_weight: float = Field(
+        0.3, gt=0.0, le=100.0, description="w: larger ones trust Q farther from the policy (m s)"
+    )
+    ascents: int = Field(4, ge=1, le=1000, description="steps of gradient ascent to u*")
+    ascent_rate: float = Field(0.5, gt=0.0, le=1.0, description="share of the way that a step of ascent takes")
 
 
 class LearnerSettings(Settings):
@@ -55,9 +78,7 @@ class LearnerSettings(Settings):
     observation: Observation = Field(
         "shape", description="what the policy sees: the sensors of the paper (Sec. IV-C), or the nodes as well"
     )
-    hidden_layers: tuple[LayerWidth, ...] = Field(
-        (128, 128, 128), strict=False, min_length=1, max_length=8, description="tanh units per hidden layer"
-    )
+    hidden_layers: HiddenLayers = Field((128, 128, 128), description="tanh units per hidden layer")
     epochs: int = Field(8, ge=1, le=1000, description="passes over the pairs per S-step")
     batch: int = Field(512, ge=1, le=100_000, description="pairs per gradient step")
     learning_rate: float = Field(1e-3, gt=0.0, le=1.0, description="initial step of Adam, decays to zero")
@@ -65,6 +86,7 @@ class LearnerSettings(Settings):
     value_from: int = Field(
         0, ge=0, le=10_000, description="iteration from which a learned action value improves the actions; 0: never"
     )
+    action_value: ActionValueSettings = ActionValueSettings()
 
     @model_validator(mode="after")
     def _value_in_canonical_frames(self) -> "LearnerSettings":

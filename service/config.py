@@ -6,7 +6,7 @@ import copy
 import difflib
 import json
 import tomllib
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from importlib import resources
 from pathlib import Path
 from typing import TYPE_CHECKING
@@ -200,12 +200,16 @@ def _siblings(key: str) -> list[str]:
 
 
 def _known_keys() -> list[str]:
-    return [
-        f"{section}.{name}"
-        for section, field in Config.model_fields.items()
-        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel)
-        for name in field.annotation.model_fields
-    ]
+    return list(_keys(Config, ""))
+
+
+def _keys(section: type[BaseModel], prefix: str) -> Iterator[str]:
+    """Dotted keys of a section and of those in it."""
+    for name, field in section.model_fields.items():
+        if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+            yield from _keys(field.annotation, f"{prefix}{name}.")
+        else:
+            yield prefix + name
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

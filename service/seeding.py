@@ -2,13 +2,33 @@
 
 from __future__ import annotations
 
+from enum import IntEnum, unique
+
 import numpy as np
 
+from t6gps.learner import streams
 from t6gps.service.config import Config
 from t6gps.storage.records import EpisodePlan
 
-TRAINING, LEARNER, EVALUATION, EVALUATION_TERRAIN = range(4)
-"""First spawn key below the run's seed; the learner room uses LEARNER = 1 for its own streams."""
+
+@unique
+class Branch(IntEnum):
+    """First spawn key below a run's seed. No number comes twice: equal branches would draw equal numbers.
+
+    TRAINING             seeds of the episodes that are learned from, and of their ground
+    LEARNER              the learner, which has streams of its own below it (`learner.streams`)
+    EVALUATION           seeds of noise-free episodes, and of their ground
+    EVALUATION_TERRAIN   seeds of their ground alone, where it has a seed of its own
+    BASELINES            baselines that draw random numbers (`studies.baselines`)
+    """
+
+    TRAINING = 0
+    LEARNER = streams.LEARNER
+    EVALUATION = 2
+    EVALUATION_TERRAIN = 3
+    BASELINES = 4
+
+
 QUIET = 0.2
 """Factor of the noise in quiet episodes."""
 
@@ -24,7 +44,7 @@ def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
     return [
         _plan(
             config,
-            seeds=_seeds(config.run.seed, TRAINING, iteration, index),
+            seeds=_seeds(config.run.seed, Branch.TRAINING, iteration, index),
             episode_id=iteration * size + index,
             iteration=iteration,
             index=index,
@@ -51,9 +71,9 @@ def evaluation_plans(
     """Noise-free plans on seeds that no training plan uses; the terrain changes with `terrain_seed` if given."""
     plans = []
     for index in range(episodes):
-        start, terrain = _seeds(seed, EVALUATION, index)
+        start, terrain = _seeds(seed, Branch.EVALUATION, index)
         if terrain_seed is not None:
-            terrain = _seeds(terrain_seed, EVALUATION_TERRAIN, index)[1]
+            terrain = _seeds(terrain_seed, Branch.EVALUATION_TERRAIN, index)[1]
         plans.append(_plan(config, (start, terrain), index, version, index, noise_std_m=0.0, version=version))
     return plans
 
@@ -80,7 +100,12 @@ def _plan(
     )
 
 
-def _seeds(root: int, *key: int) -> tuple[int, int]:
+def sequence(root: int, branch: Branch, *further: int) -> np.random.SeedSequence:
+    """The root of a branch, or of one of its parts, below a seed."""
+    return np.random.SeedSequence(root, spawn_key=(int(branch), *further))
+
+
+def _seeds(root: int, branch: Branch, *further: int) -> tuple[int, int]:
     """Two 63-bit seeds: of the episode and of its terrain."""
-    first, second = np.random.SeedSequence(root, spawn_key=key).generate_state(2, np.uint64) >> np.uint64(1)
+    first, second = sequence(root, branch, *further).generate_state(2, np.uint64) >> np.uint64(1)
     return int(first), int(second)

@@ -66,6 +66,11 @@ class Episode:
         return int(self.summary.column("episode_id")[0].as_py())
 
     @property
+    def noise_std_m(self) -> float:
+        """Exploration noise per cable that it was planned with (m)."""
+        return float(self.summary.column("noise_std_m")[0].as_py())
+
+    @property
     def nbytes(self) -> int:
         """Memory that it takes."""
         return int(self.frames.nbytes if self.packed is None else self.packed.size)

@@ -16,9 +16,11 @@ from numpy.typing import NDArray
 
 from t6gps.storage.errors import DataError
 
-SCHEMA_VERSION = 4
-"""Grows with every change. Versions 2 and 3 added columns at the end of `iterations`, version 2 of `classes`; they are
-nullable, since older runs have none. Version 4 added the nodes to `observation`."""
+SCHEMA_VERSION = 5
+"""Grows with every change. Versions 2, 3 and 5 added columns at the end of `iterations`, version 2 of `classes`; they
+are nullable, since older runs have none. Version 4 added the nodes to `observation`. Version 5 has null where older
+versions had 0 for what there is none of: standard errors of one episode, waypoints of a far direction, modes and
+residual of a class without a sample."""
 SENSORS_N, SHAPE_N = 47, 36
 OBSERVATION_N = SENSORS_N + SHAPE_N
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
@@ -94,15 +96,21 @@ EPISODES = _schema(
     _scalar("ended_by", pa.string(), "", "completed, or why the simulation was stopped"),
     _scalar("cost", pa.float64(), "m2/s2", "mean running cost over rows 1 .. T"),
     _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "mean forward speed over rows 1 .. T"),
-    _scalar("stuck_share", pa.float64(), "1", "share of rows 1 .. T with a speed below 0.05 m/s"),
+    _scalar("stuck_share", pa.float64(), "1", "stuck by speed: share of rows 1 .. T with a speed below 0.05 m/s"),
     _scalar(
         "stuck_share_by_distance",
         pa.float64(),
         "1",
-        "share of rows 10 .. T less than 0.05 m from the place of 1 s before; null for T < 10",
+        "stuck by distance: share of rows 10 .. T less than 0.05 m from the place of 1 s before; null for T < 10",
         nullable=True,
     ),
-    _scalar("waypoints_reached", pa.int32(), "1", "waypoints reached"),
+    _scalar(
+        "waypoints_reached",
+        pa.int32(),
+        "1",
+        "waypoints reached before their time was up; null where the task has directions",
+        nullable=True,
+    ),
     _scalar("path_length_m", pa.float64(), "m", "length of the horizontal path of the centre of mass"),
     _scalar("transitions", pa.int32(), "1", "changes of the support triangle"),
     _scalar("bar_mass_kg", pa.float64(), "kg", "mass of a bar in this episode"),
@@ -112,6 +120,7 @@ EPISODES = _schema(
     _scalar("delay_steps", pa.int32(), "1", "control steps from a command to its effect"),
 )
 
+_STANDARD_ERROR = "standard error over episodes; null for a single one"
 _POLICY_KL = _scalar(
     "policy_kl", pa.float64(), "nat", "mean KL divergence of the new policy from the one that sampled", nullable=True
 )
@@ -122,11 +131,17 @@ ITERATIONS = _schema(
     _scalar("episodes", pa.int32(), "1", "episodes sampled"),
     _scalar("steps", pa.int64(), "1", "control steps sampled"),
     _scalar("cost", pa.float64(), "m2/s2", "mean over episodes of the running cost"),
-    _scalar("cost_standard_error", pa.float64(), "m2/s2", "standard error over episodes"),
+    _scalar("cost_standard_error", pa.float64(), "m2/s2", _STANDARD_ERROR, nullable=True),
     _scalar("forward_speed_m_per_s", pa.float64(), "m/s", "mean over episodes"),
-    _scalar("forward_speed_standard_error", pa.float64(), "m/s", "standard error over episodes"),
-    _scalar("stuck_share", pa.float64(), "1", "mean over episodes"),
-    _scalar("waypoints_per_episode", pa.float64(), "1", "mean over episodes"),
+    _scalar("forward_speed_standard_error", pa.float64(), "m/s", _STANDARD_ERROR, nullable=True),
+    _scalar("stuck_share", pa.float64(), "1", "stuck by speed: mean over episodes"),
+    _scalar(
+        "waypoints_per_episode",
+        pa.float64(),
+        "1",
+        "waypoints reached: mean over episodes; null where the task has directions",
+        nullable=True,
+    ),
     _scalar("segments", pa.int32(), "1", "segments cut from the episodes"),
     _scalar("classes", pa.int32(), "1", "segment classes with models of their own"),
     _scalar("modes", pa.float64(), "1", "mean number of modes per class and time step"),
@@ -150,6 +165,13 @@ ITERATIONS = _schema(
         nullable=True,
     ),
     _scalar("left_out", pa.int32(), "1", "planned episodes that kept failing and are not in the data", nullable=True),
+    _scalar(
+        "stuck_share_by_distance",
+        pa.float64(),
+        "1",
+        "stuck by distance: mean over the episodes that last 1 s; null where none does",
+        nullable=True,
+    ),
 )
 
 CLASSES = _schema(
@@ -162,8 +184,14 @@ CLASSES = _schema(
     _scalar("rows", pa.int32(), "1", "control steps in these segments"),
     _scalar("time_steps", pa.int32(), "1", "aligned time steps, T_xi"),
     _scalar("pooled", pa.bool_(), "1", "too rare for models of its own: uses those pooled over its kind"),
-    _scalar("modes", pa.float64(), "1", "mean number of modes per time step"),
-    _scalar("residual", pa.float64(), "1", "mean residual of the assigned models in standard deviations"),
+    _scalar("modes", pa.float64(), "1", "mean number of modes per time step; null without a sample", nullable=True),
+    _scalar(
+        "residual",
+        pa.float64(),
+        "1",
+        "mean residual of the assigned models in standard deviations; null without a sample",
+        nullable=True,
+    ),
     _scalar(
         "cost", pa.float64(), "m2/s2", "mean running cost of the states that the class's steps lead to", nullable=True
     ),

@@ -55,6 +55,25 @@ def patches(tree: ast.Module) -> list[str]:
     ]
 
 
+ROOTS = {"learner/streams.py", "service/seeding.py", "workers/episode/streams.py"}
+"""Where the branches of random numbers are named, each in an enum."""
+OF_ONE_SEED = {"workers/ground/terrain.py", "workers/stub.py"}
+"""What draws from a seed that nothing else draws from: hills, and episodes of a worker on paper."""
+
+
+def makers(tree: ast.Module) -> set[str]:
+    """Names of the calls that make random numbers of a seed."""
+    called = {node.func.attr for node in ast.walk(tree) if isinstance(node, ast.Call) and hasattr(node.func, "attr")}
+    return called & {"SeedSequence", "default_rng", "spawn", "RandomState", "seed", "manual_seed"}
+
+
+def test_random_numbers_come_from_named_branches_alone() -> None:
+    made = {module: makers(tree) for module, tree in PACKAGE.items() if "/bench/" not in module}
+    drawing = {module for module, calls in made.items() if calls}
+    assert drawing - ROOTS - OF_ONE_SEED == {"service/studies/baselines.py"}, "its generator is of a branch of seeding"
+    assert made["service/studies/baselines.py"] == {"default_rng"}
+
+
 def test_no_folder_is_crowded() -> None:
     folders: dict[str, int] = {}
     for module in PACKAGE:

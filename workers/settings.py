@@ -9,6 +9,10 @@ from t6gps.storage.settings import Settings
 STEEPEST_DIFFICULTY = 1.5
 """Slopes of 48 deg on average, heights over a range of 2.3 m."""
 
+HALF_DIAMETER_M = 1.084492969087398
+"""Distance of a node from the centre in the neutral shape. The paper's waypoints "are half the diameter of the vehicle"
+(Sec. IV-A), which may also mean their diameter: the radius would then be half of this."""
+
 
 def _none_for(old: int | str) -> BeforeValidator:
     """Reads `old` as None: it says so where TOML has no null, and in configurations of older runs."""
@@ -67,6 +71,9 @@ class TaskSettings(Settings):
     waypoints: int = Field(5, ge=1, le=100, description="random waypoints of an episode, visited in a circle")
     nearest_waypoint_m: float = Field(2.0, gt=0.0, le=20.0, description="least distance between waypoints (m)")
     farthest_waypoint_m: float = Field(4.0, gt=0.0, le=20.0, description="largest distance between waypoints (m)")
+    waypoint_radius_m: float = Field(
+        HALF_DIAMETER_M, gt=0.0, le=10.0, description="a waypoint is reached within it; half the robot's diameter (m)"
+    )
     waypoint_timeout_s: float = Field(5.0, gt=0.0, le=1000.0, description="the next waypoint comes after this time (s)")
     directions: Directions = Field(
         None, description="J: one rest state, episode i heads for direction i modulo J; none: random starts, waypoints"

@@ -4,15 +4,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-import numpy as np
-
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
-from t6gps.workers.episode import policy
+from t6gps.workers.episode import policy, streams
 from t6gps.workers.episode.randomisation import draw
 from t6gps.workers.episode.recording import Record
 from t6gps.workers.episode.rollout import rollout
 from t6gps.workers.episode.stance import check_stance
+from t6gps.workers.episode.streams import Stream
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.engine import Engine, Unique
 from t6gps.workers.robot.topology import CABLES_N
@@ -20,9 +19,6 @@ from t6gps.workers.settings import RobotSettings, RolloutSettings
 
 LAST_STATES_N = 5
 """Half a second: enough to see where a failed episode was heading."""
-
-RANDOMISATION_STREAM = 3
-"""Branch of an episode's seed; the first three are start, course and exploration (`episode`)."""
 
 
 class RolloutWorker(Unique):
@@ -43,7 +39,7 @@ class RolloutWorker(Unique):
         """Run one episode. DataError if the policy does not fit the robot, PhysicsError if the start is unsound."""
         self._record = Record()
         policy.check(snapshot, (SENSORS_N, OBSERVATION_N), CABLES_N)
-        rng = np.random.default_rng(np.random.SeedSequence(plan.seed, spawn_key=(RANDOMISATION_STREAM,)))
+        rng = streams.generator(plan.seed, Stream.ROBOT)
         robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
         if robot != self._engine.robot:
             self._engine.close()

@@ -34,6 +34,8 @@ BINS = 8
 LOOPED = 200
 """Sub-trajectories that the loop solves as well."""
 LARGEST_GAIN_ERROR = 1e-6
+NOISE_STD_M = 0.15
+"""All episodes count as explored alike: no duration depends on it."""
 TARGET_SPEED_M_PER_S = 0.8
 VERTICAL_WEIGHT = 0.1
 
@@ -58,7 +60,7 @@ def measure(
     reading = Canonical(settings.reduced_state)
     taken = Episodes([reading], settings.longest_segment_steps)
     for table in episodes:
-        taken.add(table.column("episode_id")[0].as_py(), table)
+        taken.add(table.column("episode_id")[0].as_py(), table, {"noise_std_m": NOISE_STD_M})
     columns, pieces = taken.joined()
     rows = reading.rows(columns)
     options = modes.FitOptions(settings.modes, settings.residual_threshold, settings.prior_samples, settings.ridge)
@@ -79,7 +81,7 @@ def _seconds(work: Callable[[], object]) -> float:
 def _phases(learner: Learner, episodes: Sequence[pa.Table], settings: LearnerSettings) -> dict[str, float]:
     for _ in range(2):
         for table in episodes:
-            learner.add(table)
+            learner.add(table, NOISE_STD_M)
         spent = {f"{phase.name}_s": _seconds(partial(list, getattr(learner, phase.name)())) for phase in PHASES}
     steps = sum(table.num_rows - 1 for table in episodes)
     return {"steps": steps, "pairs": steps * (1 + min(settings.replay_iterations, 1)), **spent}

@@ -31,29 +31,11 @@ from t6gps.learner.algorithm import supervised
 from t6gps.learner.improvers.transitions import INPUTS_N, MOVED, Transitions, joined
 from t6gps.learner.port import Arrays
 from t6gps.learner.rows import AnyArray, Floats, Ints, pieces
+from t6gps.learner.settings import ActionValueSettings
 from t6gps.storage.records import PolicySnapshot
 
-REMEMBERED_N = 3
-"""Iterations whose transitions are learned from; six are no better."""
-DISCOUNT = 0.95
-"""Per control step: a horizon of two seconds."""
-HIDDEN = (128, 128)
-BATCH = 256
-STEPS = 600
-FIRST_STEPS = 1800
-"""Gradient steps per iteration, and of the first one, which finds a network that knows nothing."""
-LEARNING_RATE = 1e-3
-WEIGHT_DECAY = 0.01
 PREPARED_N = 30
 """Gradient steps whose transitions are prepared at once."""
-TARGET_RATE = 0.005
-"""The network in the temporal-difference target follows the learned one by this share per step."""
-OWN_SHARE = 0.5
-"""Share of transitions that are learned from with the direction of their waypoint."""
-STEP_WEIGHT = 0.3
-"""w (m2 s/m): larger ones trust the value farther from the policy."""
-ASCENTS = 4
-ASCENT_RATE = 0.5
 
 
 class ActionValue:
@@ -62,18 +44,25 @@ class ActionValue:
     target_speed_m_per_s, vertical_weight   v* of the cost and weight of the vertical velocity in it
     """
 
-    def __init__(self, target_speed_m_per_s: float, vertical_weight: float, rng: np.random.Generator) -> None:
+    def __init__(
+        self,
+        settings: ActionValueSettings,
+        target_speed_m_per_s: float,
+        vertical_weight: float,
+        rng: np.random.Generator,
+    ) -> None:
+        self._settings = settings
         self._target_speed_m_per_s, self._vertical_weight = target_speed_m_per_s, vertical_weight
-        first = policy.initial(INPUTS_N, 1, HIDDEN, rng, offset_m=0.0, scale_m=1.0)
+        first = policy.initial(INPUTS_N, 1, settings.hidden_layers, rng, offset_m=0.0, scale_m=1.0)
         self._vector, self._layers = policy.parameters(first)
         self._target, self._target_layers = policy.parameters(first)
         self._moments = supervised.no_moments(self._vector)
-        self._remembered: deque[Transitions] = deque(maxlen=REMEMBERED_N)
+        self._remembered: deque[Transitions] = deque(maxlen=settings.remembered_iterations)
 
     @property
     def steps_n(self) -> int:
         """Gradient steps that `learn` will take."""
-        return STEPS if self._moments.step else FIRST_STEPS
+        return self._settings.steps if self._moments.step else self._settings.first_steps
 
     def add(self, transitions: Transitions) -> None:
         """Take the transitions of one iteration; those of the oldest go."""
@@ -86,43 +75,45 @@ class ActionValue:
     def learn(self, snapshot: PolicySnapshot, rng: np.random.Generator) -> Iterator[None]:
         """Take `steps_n` gradient steps towards the value of a policy; yields after each."""
         torch.set_num_threads(1)
-        known = joined(self._remembered)
+        known, batch_n = joined(self._remembered), self._settings.batch
         index = np.flatnonzero(known.acts)
         mean = self._mean_reward(known, index)
         act = _actor(snapshot)
-        for _ in range(self.steps_n // PREPARED_N):
-            rows = rng.choice(index, PREPARED_N * BATCH)
+        for prepared_n in _portions(self.steps_n):
+            rows = rng.choice(index, prepared_n * batch_n)
             anywhere = rng.uniform(-np.pi, np.pi, len(rows)).astype(np.float32)
-            heading = np.where(rng.random(len(rows)) < OWN_SHARE, known.heading[rows], anywhere)
+            heading = np.where(rng.random(len(rows)) < self._settings.own_heading_share, known.heading[rows], anywhere)
             direction = known.direction(rows + 1, heading)
             before, _ = known.take(rows, known.direction(rows, heading))
             after, rest_lengths = known.take(rows + 1, direction)
             after[:, MOVED] = _moved(act(after), rest_lengths, known.reach_m)
             reward = torch.from_numpy(self._reward(known, rows + 1, direction) - mean)
-            prepared = (part.view(PREPARED_N, BATCH, -1) for part in (before, after, reward))
+            prepared = (part.view(prepared_n, batch_n, -1) for part in (before, after, reward))
             for batch in zip(*prepared, strict=True):
                 self._step(*batch)
                 yield
 
     def _step(self, before: torch.Tensor, after: torch.Tensor, reward: torch.Tensor) -> None:
         """One gradient step on transitions: [s; e] before and after [m, ni], and the reward [m, 1]."""
-        wanted = policy.activations(self._target_layers, after)[-1].mul_(DISCOUNT).add_(reward)
-        change = supervised.gradient(self._layers, before, wanted, BATCH)
-        supervised.descend(self._vector, change, self._moments, LEARNING_RATE, WEIGHT_DECAY)
-        self._target.lerp_(self._vector, TARGET_RATE)
+        settings = self._settings
+        wanted = policy.activations(self._target_layers, after)[-1].mul_(settings.discount).add_(reward)
+        change = supervised.gradient(self._layers, before, wanted, len(before))
+        supervised.descend(self._vector, change, self._moments, settings.learning_rate, settings.weight_decay)
+        self._target.lerp_(self._vector, settings.target_rate)
 
     def improved(self, snapshot: PolicySnapshot) -> Floats:
         """u* [n, nu] (m) at the rows of the newest transitions."""
         torch.set_num_threads(1)
-        newest, act = self._remembered[-1], _actor(snapshot)
+        newest, act, settings = self._remembered[-1], _actor(snapshot), self._settings
 
         def climb(rows: Ints) -> torch.Tensor:
             inputs, rest_lengths = newest.take(rows)
             start = act(inputs)
             command = start.clone()
-            for _ in range(ASCENTS):
+            for _ in range(settings.ascents):
                 inputs[:, MOVED] = _moved(command, rest_lengths, newest.reach_m)
-                command += ASCENT_RATE * (start + STEP_WEIGHT * self.slope(inputs, newest.reach_m) - command)
+                wanted = start + settings.step_weight * self.slope(inputs, newest.reach_m)
+                command += settings.ascent_rate * (wanted - command)
             return command
 
         n = len(newest.acts)
@@ -155,7 +146,7 @@ class ActionValue:
         """dQ/du [m, nu] (1/s) at inputs [s; e] [m, ni]: zero where the winch cannot reach."""
         values = policy.activations(self._layers, inputs)
         back = self._layers[-1][0].expand(len(inputs), -1)
-        for number in reversed(range(len(HIDDEN))):
+        for number in reversed(range(len(self._layers) - 1)):
             back = torch.ops.aten.tanh_backward(back, values[number + 1]) @ self._layers[number][0]
         return back[:, MOVED].mul(inputs[:, MOVED].abs() < 1).div_(reach_m)
 
@@ -171,6 +162,11 @@ class ActionValue:
         self._target.copy_(torch.from_numpy(arrays["value_target"]))
         names = supervised.Moments._fields
         self._moments = supervised.Moments(*(torch.from_numpy(arrays[f"value_{name}"]) for name in names))
+
+
+def _portions(steps_n: int) -> list[int]:
+    """Gradient steps in portions of PREPARED_N; the last may be smaller."""
+    return [min(PREPARED_N, steps_n - first) for first in range(0, steps_n, PREPARED_N)]
 
 
 def _moved(command: torch.Tensor, rest_lengths: torch.Tensor, reach_m: float) -> torch.Tensor:

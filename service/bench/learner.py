@@ -46,7 +46,7 @@ def _rolling(config: Config, say: Say) -> list[Episode]:
     with closing(RayExecutor(config)) as executor:
         say(f"sampling {len(untrained)} and {len(trained)} episodes")
         for episode in _sampled(executor, untrained, taught.policy()):
-            taught.add(episode.frames)
+            taught.add(episode.frames, episode.noise_std_m)
         for phase in PHASES:
             for _ in getattr(taught, phase.name)():
                 pass

@@ -81,7 +81,7 @@ def train(
         _exit_interrupted(_train_command(run, source, root, overrides))
     from t6gps.service.views import run_figures
 
-    pictures = run_figures.draw(run, config.terrain)
+    pictures = run_figures.draw(run, config)
     stored.print_learning(run)
     terminal.print_evaluation(result)
     live.name_quarantined(run)

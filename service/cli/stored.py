@@ -113,8 +113,9 @@ def render(
     row = tables.read(run, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
     config = configuration.parse(run.config_path.read_text())
     terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+    radius_m = config.task.waypoint_radius_m
     with terminal.task("rendering") as progress:
-        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress)
+        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress, waypoint_radius_m=radius_m)
     typer.echo(out)
 
 

@@ -27,7 +27,7 @@ from t6gps.service.ray_backend.worker_actor import Answer
 from t6gps.storage import ipc, spool
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
-from t6gps.storage.records import PolicySnapshot
+from t6gps.storage.records import Episode, PolicySnapshot
 
 Job = TypeVar("Job")
 Result = TypeVar("Result")
@@ -50,12 +50,15 @@ class LearnerActor:
         """Take episodes that lie in the object store."""
         for answer in answers:
             assert answer.packed is not None, "only episodes are streamed"
-            self._learner.add(ipc.unpack(answer.packed, 1)[0])
+            self._take(Episode(*ipc.unpack(answer.packed, 2)))
 
     def add_spooled(self, files: Sequence[Path]) -> None:
         """Take episodes that lie in the spool."""
         for file in files:
-            self._learner.add(spool.read(file).frames)
+            self._take(spool.read(file))
+
+    def _take(self, episode: Episode) -> None:
+        self._learner.add(episode.frames, episode.noise_std_m)
 
     def learn(self, phase: Phase) -> Progress:
         """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""

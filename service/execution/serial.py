@@ -73,11 +73,11 @@ class SerialExecutor(Executor):
         """Nothing runs beside the learner here: all plans are left to `sample`."""
 
     def feed(self, episode: Episode) -> None:
-        self._learner.add(episode.frames)
+        self._learner.add(episode.frames, episode.noise_std_m)
 
     def feed_spooled(self, files: Sequence[Path]) -> None:
         for file in files:
-            self._learner.add(spool.read(file).frames)
+            self.feed(spool.read(file))
 
     def learn(self, phase: Phase) -> Progress:
         yield from getattr(self._learner, phase.name)()

@@ -15,6 +15,7 @@ from matplotlib.ticker import MaxNLocator
 
 from t6gps.service.studies import ground_figures
 from t6gps.service.studies.conduct import Finished
+from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.views.run_figures import BLUE, DARK, GREEN, GREY, ORANGE, PURPLE, RED, SKY, STYLE, canvas, numbers
 from t6gps.storage import tables
 
@@ -22,8 +23,8 @@ COLOURS = (BLUE, ORANGE, GREEN, RED, PURPLE, SKY, DARK, GREY)
 """Of the arms of a panel in their order; from the ninth on they come again."""
 QUANTITIES = {
     "forward_speed_m_per_s": ("speed to the waypoint (m/s)", 1),
-    "stuck_share": ("below 0.05 m/s (%)", 100),
-    "stuck_share_by_distance": ("below 5 cm in 1 s (%)", 100),
+    "stuck_share_by_distance": ("stuck: below 5 cm in 1 s (%)", 100),
+    "stuck_share_by_speed": ("below 0.05 m/s (%)", 100),
     "waypoints_per_episode": ("waypoints per episode", 1),
     "cost": ("cost (m²/s²)", 1),
 }
@@ -51,10 +52,7 @@ def evaluations(finished: Sequence[Finished]) -> Figure:
             for column, (key, (title, factor)) in enumerate(QUANTITIES.items()):
                 axes = row[column]
                 for place, (runs, colour) in enumerate(zip(labels.values(), cycle(COLOURS), strict=False)):
-                    means = [outcome.evaluation.estimates()[key].mean for outcome in runs]
-                    values = factor * np.array([mean for mean in means if mean is not None])
-                    if len(values):
-                        _dots(axes, place, values, colour)
+                    _dots(axes, place, factor * _known([outcome.evaluation for outcome in runs], key), colour)
                 axes.set_yticks(range(len(labels)), list(labels) if column == 0 else [""] * len(labels))
                 axes.set_ylim(len(labels) - 0.4, -0.6)
                 axes.grid(visible=False, axis="y")
@@ -62,6 +60,12 @@ def evaluations(finished: Sequence[Finished]) -> Figure:
                 axes.set_xlabel(title if panel == list(panels)[-1] else "")
             row[0].set_title(panel)
     return figure
+
+
+def _known(evaluations: Sequence[Evaluation], key: str) -> Values:
+    """Means of a quantity in the evaluations that have it."""
+    means = [evaluation.estimates()[key].mean for evaluation in evaluations]
+    return np.array([mean for mean in means if mean is not None], dtype=float)
 
 
 def _dots(axes: Axes, place: float, values: Values, colour: str) -> None:
@@ -168,8 +172,7 @@ def conditions(finished: Sequence[Finished]) -> Figure:
                 axes.plot([], [], color=colour, marker="o", linestyle="", label=label)
                 for place, name in enumerate([None, *names]):
                     worlds = [outcome.evaluation if name is None else outcome.conditions[name] for outcome in runs]
-                    means = np.array([evaluation.estimates()[key].mean for evaluation in worlds], dtype=float)
-                    _dots(axes, place + lift, factor * means, colour)
+                    _dots(axes, place + lift, factor * _known(worlds, key), colour)
             axes.set_yticks(range(len(names) + 1), ["as trained", *names])
             axes.set_ylim(len(names) + 0.6, -0.6)
             axes.set_xlabel(title)

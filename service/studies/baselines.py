@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.config import Config
+from t6gps.service.seeding import Branch
 from t6gps.service.studies.declared import Baseline
 from t6gps.service.studies.watcher import Progress, Watcher
 from t6gps.service.training import evaluation, session
@@ -36,8 +37,6 @@ if TYPE_CHECKING:
 
 Array = NDArray[np.float64]
 
-BASELINES_STREAM = 4
-"""First spawn key below the run's seed; `seeding` has the others."""
 OFFSPRING_N, PARENTS_N = 12, 4
 FIRST_SPREAD, SPREAD_DECAY = 0.5, 0.97
 """Standard deviation of the first generation, in units of `gaits.WAVE_SCALE_M`, and its factor per generation."""
@@ -92,7 +91,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
     generations = steps // (OFFSPRING_N * EVOLUTION_STEPS)
     if not generations:
         raise RunError(f"{steps} steps make up no generation of {OFFSPRING_N} x {EVOLUTION_STEPS}; allow more steps")
-    rng = np.random.default_rng(np.random.SeedSequence(config.run.seed, spawn_key=(BASELINES_STREAM,)))
+    rng = np.random.default_rng(seeding.sequence(config.run.seed, Branch.BASELINES))
     settings = config.rollout
     terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": None})
     settings = settings.model_copy(

@@ -173,7 +173,7 @@ def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
         return
     with watcher.run(trial.config.run.iterations) as observer:
         session.complete(trial.config, run, serial, observer)
-    run_figures.draw(run, trial.config.terrain)
+    run_figures.draw(run, trial.config)
 
 
 def _evaluated(trial: Trial, run: Run, overrides: Sequence[str], serial: bool, watcher: Watcher) -> Evaluation:

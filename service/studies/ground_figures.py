@@ -96,7 +96,7 @@ def ground_track(finished: Sequence[Finished]) -> Figure:
     newest = pc.field("iteration") == tables.committed_iterations(run) - 1
     frames = tables.read(run, "frames", run_figures.TRACK_COLUMNS, newest)
     episodes = tables.read(run, "episodes", filter=newest)
-    return run_figures.ground_track(frames, episodes, finished[0].trial.config.terrain)
+    return run_figures.ground_track(frames, episodes, finished[0].trial.config)
 
 
 def largest_climb(finished: Sequence[Finished]) -> Climb:
@@ -161,7 +161,8 @@ def climb(finished: Sequence[Finished]) -> Figure:
     """Snapshots of the largest climb by the project's own renderer, and the height along it (paper Sec. V-C)."""
     climb_ = largest_climb(finished)
     steps = np.linspace(climb_.bottom, climb_.top, SNAPSHOTS_N).round().astype(int).tolist()
-    picture = render.snapshots(climb_.frames, climb_.terrain, steps)
+    radius_m = climb_.outcome.trial.config.task.waypoint_radius_m
+    picture = render.snapshots(climb_.frames, climb_.terrain, steps, radius_m)
     with rc_context(STYLE):
         figure = canvas(11, 7.6)
         above, below = figure.subplots(2, 1, height_ratios=[2.6, 1])

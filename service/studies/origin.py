@@ -19,14 +19,14 @@ FILE = "origin.json"
 class Origin:
     """A study's run: its place in the study, the commits that worked on it, their seconds, the cores of the machine.
 
-    Study, arm, seed and cores are None where no study has worked on the run.
+    All but the commits are None where no study has worked on the run.
     """
 
     study: str | None = None
     arm: str | None = None
     seed: int | None = None
     commits: tuple[str, ...] = ()
-    wall_s: float = 0.0
+    wall_s: float | None = None
     cores: int | None = None
 
 
@@ -46,7 +46,7 @@ def recorded(run: Run, study: str, arm: str, seed: int, commit: str) -> Iterator
     commits = before.commits if commit in before.commits else (*before.commits, commit)
 
     def keep() -> None:
-        wall_s = round(before.wall_s + time.perf_counter() - start, 1)
+        wall_s = round((before.wall_s or 0.0) + time.perf_counter() - start, 1)
         record = Origin(study, arm, seed, commits, wall_s, os.cpu_count())
         path = run.path / FILE
         durable.hidden(path).write_text(json.dumps(asdict(record), indent=2) + "\n")

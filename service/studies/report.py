@@ -23,6 +23,7 @@ ITERATION_COLUMNS = (
     "iteration",
     "cost",
     "forward_speed_m_per_s",
+    "stuck_share_by_distance",
     "stuck_share",
     "waypoints_per_episode",
     "segments",
@@ -60,7 +61,10 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
 
 
 def run_rows(finished: Sequence[Finished]) -> list[Row]:
-    """One row per run: its arm and seed, what it sampled, and its evaluation."""
+    """One row per run: its arm and seed, the steps that it sampled, and its evaluation.
+
+    The steps of a baseline are those that it was allowed.
+    """
     rows = []
     for outcome in finished:
         iterations = tables.read(outcome.run, "iterations").sort_by("iteration").to_pylist()
@@ -70,7 +74,7 @@ def run_rows(finished: Sequence[Finished]) -> list[Row]:
                 "run": outcome.run.name,
                 "arm": outcome.trial.arm,
                 "seed": outcome.trial.seed,
-                "steps": outcome.trial.training_steps,
+                "steps": sum(row["steps"] for row in iterations) if iterations else outcome.trial.training_steps,
                 **evaluated,
                 "modes": iterations[-1]["modes"] if iterations else None,
                 "learning_s": sum(row[key] for row in iterations for key in DURATIONS) if iterations else None,
@@ -87,7 +91,8 @@ def arm_rows(finished: Sequence[Finished]) -> list[Row]:
     result = []
     for arm in dict.fromkeys(row["arm"] for row in rows):
         seeds = [row for row in rows if row["arm"] == arm]
-        summary: Row = {"arm": arm, "seeds": len(seeds), "steps": seeds[0]["steps"]}
+        summary: Row = {"arm": arm, "seeds": len(seeds)}
+        summary["steps"] = round(np.mean([row["steps"] for row in seeds]))
         summary |= spread_of(seeds)
         for key in ("modes", "learning_s", "wall_s"):
             known = [row[key] for row in seeds if row[key] is not None]
@@ -126,7 +131,7 @@ def condition_table(finished: Sequence[Finished]) -> str:
     for row in condition_rows(finished):
         groups.setdefault((row["arm"], row["condition"]), []).append(row)
     lines = [
-        "| arm | condition | speed to the waypoint (m/s) | below 5 cm in 1 s (%) | cost |",
+        "| arm | condition | speed to the waypoint (m/s) | stuck: below 5 cm in 1 s (%) | cost |",
         "|---|---|---|---|---|",
     ]
     for (arm, condition), rows in groups.items():
@@ -157,8 +162,8 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 def markdown(arms: Sequence[Row]) -> str:
     """The table of arms: noise-free policies, mean +- standard deviation between seeds."""
     lines = [
-        "| arm | seeds | steps | speed to the waypoint (m/s) | waypoints per episode | below 0.05 m/s (%) "
-        "| below 5 cm in 1 s (%) | cost | modes | learning (s) |",
+        "| arm | seeds | steps | speed to the waypoint (m/s) | waypoints per episode "
+        "| stuck: below 5 cm in 1 s (%) | below 0.05 m/s (%) | cost | modes | learning (s) |",
         "|---|---|---|---|---|---|---|---|---|---|",
     ]
     for row in arms:
@@ -168,8 +173,8 @@ def markdown(arms: Sequence[Row]) -> str:
             f"{row['steps']:,}",
             _spread(row, "forward_speed_m_per_s", 3),
             _spread(row, "waypoints_per_episode", 2),
-            _spread(row, "stuck_share", 1, 100),
             _spread(row, "stuck_share_by_distance", 1, 100),
+            _spread(row, "stuck_share_by_speed", 1, 100),
             _spread(row, "cost", 3),
             "-" if row["modes"] is None else f"{row['modes']:.2f}",
             "-" if row["learning_s"] is None else f"{row['learning_s']:.0f}",
@@ -194,7 +199,7 @@ def _page(
     pictures: Sequence[Path],
 ) -> str:
     trials = [outcome.trial for outcome in finished]
-    wall_s = sum(outcome.origin.wall_s for outcome in finished)
+    wall_s = sum(outcome.origin.wall_s or 0.0 for outcome in finished)
     commits = sorted({commit for outcome in finished for commit in outcome.origin.commits})
     seeds = sorted({trial.seed for trial in trials})
     evaluation_n = trials[0].config.run.evaluation_episodes

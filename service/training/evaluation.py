@@ -20,8 +20,8 @@ from t6gps.storage.records import Episode
 
 EVALUATED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
-    "stuck_share": "stuck_share",
     "stuck_share_by_distance": "stuck_share_by_distance",
+    "stuck_share_by_speed": "stuck_share",
     "waypoints_per_episode": "waypoints_reached",
     "cost": "cost",
 }
@@ -30,7 +30,10 @@ EVALUATED = {
 
 @dataclass(frozen=True)
 class Estimate:
-    """Mean and standard error over the episodes that have a quantity; both None where no episode has it."""
+    """Mean and standard error over the episodes that have a quantity.
+
+    Both are None where no episode has it; a single episode has no standard error.
+    """
 
     mean: float | None = None
     standard_error: float | None = None
@@ -41,17 +44,18 @@ class Evaluation:
     """What a policy does without noise, over a number of episodes whose starts and waypoints hang on `seed`.
 
     forward_speed_m_per_s       speed towards the waypoint (m/s)
-    stuck_share                 share of seconds in which the robot is slower than 0.05 m/s
-    stuck_share_by_distance     share of seconds in which it comes no further
-    waypoints_per_episode       waypoints reached
+    stuck_share_by_distance     share of time in which the robot is less than 5 cm from where it was 1 s before
+    stuck_share_by_speed        share of time in which its centre of mass is slower than 0.05 m/s in space, which one
+                                that rocks on the spot is not
+    waypoints_per_episode       waypoints reached before their time was up; None where the task has directions
     cost                        mean running cost (m2/s2)
     """
 
     episodes: int
     seed: int
     forward_speed_m_per_s: Estimate = Estimate()
-    stuck_share: Estimate = Estimate()
     stuck_share_by_distance: Estimate = Estimate()
+    stuck_share_by_speed: Estimate = Estimate()
     waypoints_per_episode: Estimate = Estimate()
     cost: Estimate = Estimate()
 
@@ -65,8 +69,10 @@ class Evaluation:
 
     @classmethod
     def from_json(cls, text: str) -> Evaluation:
-        """The evaluation that `to_json` wrote; an older run may lack a quantity."""
+        """The evaluation that `to_json` wrote; an older run may lack a quantity, or name it `stuck_share`."""
         stored = json.loads(text)
+        if "stuck_share" in stored:
+            stored["stuck_share_by_speed"] = stored.pop("stuck_share")
         estimates = {name: Estimate(**stored[name]) for name in EVALUATED if name in stored}
         return cls(episodes=stored["episodes"], seed=stored["seed"], **estimates)
 
@@ -94,10 +100,7 @@ def evaluate(
 def summarise(summaries: Sequence[pa.Table], seed: int) -> Evaluation:
     """The evaluation that episodes (rows of `episodes`) make up."""
     table = pa.concat_tables(summaries)
-    estimates = {}
-    for name, column in EVALUATED.items():
-        values = table[column].drop_null().to_numpy().astype(float)
-        estimates[name] = Estimate(*mean_and_error(values)) if len(values) else Estimate()
+    estimates = {name: Estimate(*mean_and_error(table[column])) for name, column in EVALUATED.items()}
     return Evaluation(episodes=len(summaries), seed=seed, **estimates)
 
 

@@ -162,13 +162,21 @@ def _sampled(summary: pa.Table) -> dict[str, Any]:
         ("cost", "cost_standard_error"),
         ("forward_speed_m_per_s", "forward_speed_standard_error"),
     ):
-        result[column], result[error] = mean_and_error(summary[column].to_numpy())
-    result["stuck_share"] = float(summary["stuck_share"].to_numpy().mean())
-    result["waypoints_per_episode"] = float(summary["waypoints_reached"].to_numpy().mean())
+        result[column], result[error] = mean_and_error(summary[column])
+    for column, reported in (
+        ("stuck_share", "stuck_share"),
+        ("stuck_share_by_distance", "stuck_share_by_distance"),
+        ("waypoints_reached", "waypoints_per_episode"),
+    ):
+        result[reported], _ = mean_and_error(summary[column])
     return result
 
 
-def mean_and_error(values: np.ndarray) -> tuple[float, float]:
-    """Mean and standard error over episodes (0 for a single one)."""
-    error = values.std(ddof=1) / np.sqrt(len(values)) if len(values) > 1 else 0.0
-    return float(values.mean()), float(error)
+def mean_and_error(column: pa.ChunkedArray) -> tuple[float | None, float | None]:
+    """Mean and standard error over the episodes that have a quantity.
+
+    No mean where none has it, no standard error where fewer than two have it.
+    """
+    values = column.drop_null().to_numpy()
+    mean = float(values.mean()) if len(values) else None
+    return mean, float(values.std(ddof=1) / np.sqrt(len(values))) if len(values) > 1 else None

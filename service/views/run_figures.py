@@ -22,12 +22,11 @@ from numpy.typing import NDArray
 
 from t6gps.storage import durable, schema, tables
 from t6gps.storage.catalog import Run
-from t6gps.workers.episode.task import WAYPOINT_RADIUS_M
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
 from t6gps.workers.robot.topology import DELTA, FACES, LAMBDA
-from t6gps.workers.settings import TerrainSettings
+from t6gps.workers.settings import HALF_DIAMETER_M, RolloutSettings
 
 if TYPE_CHECKING:
     from matplotlib.typing import RcKeyType
@@ -74,8 +73,8 @@ TRACK_COLUMNS = ["episode_id", "step", "com_x_m", "com_y_m", "waypoint", "waypoi
 SEGMENT_COLUMNS = ["episode_id", "step", "face", "kind", "entry_edge", "exit_edge", "nodes"]
 
 
-def draw(run: Run, terrain: TerrainSettings) -> list[Path]:
-    """Draw all figures of what the run has committed on its ground into its folder; none before the first iteration."""
+def draw(run: Run, settings: RolloutSettings) -> list[Path]:
+    """Draw all figures of what the run has committed in its world into its folder; none before the first iteration."""
     iterations, episodes = tables.read(run, "iterations"), tables.read(run, "episodes")
     if not iterations.num_rows:
         return []
@@ -84,7 +83,7 @@ def draw(run: Run, terrain: TerrainSettings) -> list[Path]:
     frames = tables.read(run, "frames", list(dict.fromkeys(TRACK_COLUMNS + SEGMENT_COLUMNS)), newest)
     figures = {
         "learning": learning(iterations),
-        "ground_track": ground_track(frames, episodes, terrain),
+        "ground_track": ground_track(frames, episodes, settings),
         "segments": segments(frames, classes),
     }
     return [save(figure, run.figures / f"{name}.png") for name, figure in figures.items()]
@@ -107,13 +106,13 @@ def numbers(table: pa.Table, name: str) -> Array:
 
 
 def learning(iterations: pa.Table) -> Figure:
-    """Cost, forward speed and stuck share of each iteration, with standard errors over its episodes."""
+    """Cost and forward speed of each iteration, with standard errors over its episodes, and how often it was stuck."""
     with rc_context(STYLE):
         figure = canvas(10, 3.2)
         panels = (
             ("Cost", "mean running cost (m²/s²)", "cost", "cost_standard_error", BLUE),
             ("Forward speed", "towards the waypoint (m/s)", SPEED, "forward_speed_standard_error", GREEN),
-            ("Stuck", "share of time below 0.05 m/s (%)", "stuck_share", None, RED),
+            ("Stuck", "share of time below 5 cm in 1 s (%)", "stuck_share_by_distance", None, RED),
         )
         for axes, (title, label, mean, error, colour) in zip(figure.subplots(1, 3), panels, strict=True):
             x, y = numbers(iterations, "iteration"), numbers(iterations, mean)
@@ -129,10 +128,10 @@ def learning(iterations: pa.Table) -> Figure:
     return figure
 
 
-def ground_track(frames: pa.Table, episodes: pa.Table, settings: TerrainSettings) -> Figure:
+def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings) -> Figure:
     """CoM track of the episode with the median forward speed, from above, with others on the same ground.
 
-    Darker ground is lower, circles have the size of the robot (paper Sec. V, the figure of the ground track).
+    Darker ground is lower, the grey circle has the size of the robot (paper Sec. V, the figure of the ground track).
     """
     order = np.argsort(numbers(episodes, SPEED), kind="stable")
     rows = episodes.to_pylist()
@@ -144,14 +143,15 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: TerrainSettings
     with rc_context(STYLE):
         figure = canvas(7, 6.2)
         axes = figure.subplots()
-        terrain = ground(settings, typical["terrain_seed"], typical["terrain_difficulty"])
+        terrain = ground(settings.terrain, typical["terrain_seed"], typical["terrain_difficulty"])
         if terrain is not None:
             contours(figure, axes, terrain, low, high)
         for other in alike[:OTHER_TRACKS_N]:
             axes.plot(*_track(frames, other)[0].T, color=GREY, alpha=0.5, linewidth=0.9, zorder=2, label="others")
-        axes.add_patch(Circle(tuple(path[0]), WAYPOINT_RADIUS_M, facecolor=GREY, alpha=0.6, zorder=3))
+        axes.add_patch(Circle(tuple(path[0]), HALF_DIAMETER_M, facecolor=GREY, alpha=0.6, zorder=3))
         for number, goal in enumerate(goals):
-            disc = Circle(tuple(goal), WAYPOINT_RADIUS_M, facecolor=(1, 1, 1, 0.6), edgecolor=DARK, zorder=3)
+            radius_m = settings.task.waypoint_radius_m
+            disc = Circle(tuple(goal), radius_m, facecolor=(1, 1, 1, 0.6), edgecolor=DARK, zorder=3)
             axes.add_patch(disc)
             axes.annotate(str(number + 1), goal, ha="center", va="center", fontweight="bold", zorder=4)
         halo = [Stroke(linewidth=4.5, foreground="white"), Normal()]

@@ -41,7 +41,8 @@ LEARNING_COLUMNS = {
     "cost_standard_error": ("+-", "{:.3f}"),
     "forward_speed_m_per_s": ("forward m/s", "{:.3f}"),
     "forward_speed_standard_error": ("+-", "{:.3f}"),
-    "stuck_share": ("stuck", "{:.1%}"),
+    "stuck_share_by_distance": ("stuck", "{:.1%}"),
+    "stuck_share": ("by speed", "{:.1%}"),
     "waypoints_per_episode": ("waypoints", "{:.2f}"),
     "sampling_s": ("sampling s", "{:.1f}"),
     "segmenting_s": ("segmenting s", "{:.1f}"),
@@ -71,8 +72,8 @@ ARM_COLUMNS = {
     "steps": ("steps", "{:,}"),
     "forward_speed_m_per_s": ("forward m/s", "{:.3f}"),
     "forward_speed_m_per_s_deviation": ("+-", "{:.3f}"),
-    "stuck_share": ("stuck by speed", "{:.1%}"),
-    "stuck_share_by_distance": ("by distance", "{:.1%}"),
+    "stuck_share_by_distance": ("stuck", "{:.1%}"),
+    "stuck_share_by_speed": ("by speed", "{:.1%}"),
     "waypoints_per_episode": ("waypoints", "{:.2f}"),
     "cost": ("cost", "{:.3f}"),
     "cost_deviation": ("+-", "{:.3f}"),
@@ -118,10 +119,15 @@ class ProgressDisplay:
         learning_s = sum(row[key] for key in ("segmenting_s", "fitting_s", "backward_pass_s", "supervised_s"))
         say(
             f"iteration {row['iteration']}: "
-            f"cost {row['cost']:.3f} +- {row['cost_standard_error']:.3f}, "
-            f"forward {row['forward_speed_m_per_s']:.3f} +- {row['forward_speed_standard_error']:.3f} m/s, "
+            f"cost {_estimate(row['cost'], row['cost_standard_error'])}, "
+            f"forward {_estimate(row['forward_speed_m_per_s'], row['forward_speed_standard_error'])} m/s, "
             f"sampled in {row['sampling_s']:.1f} s, learned in {learning_s:.1f} s"
         )
+
+
+def _estimate(mean: float, standard_error: float | None) -> str:
+    """A mean with its standard error, if there is one."""
+    return f"{mean:.3f}" if standard_error is None else f"{mean:.3f} +- {standard_error:.3f}"
 
 
 @contextmanager

@@ -24,6 +24,8 @@ from t6gps.storage.records import PolicySnapshot
 Array = NDArray[np.float64]
 
 OFFSET_M, SCALE_M = 1.088, 0.2
+NOISE_STD_M = 0.1
+"""Of every episode, unless a test says otherwise."""
 
 
 def frames_table(columns: dict[str, Any], rows: int) -> pa.Table:
@@ -152,7 +154,7 @@ def rows_and_segments(
     reading = Canonical(reduced_state)
     episodes = Episodes([reading], longest_steps)
     for table in tables:
-        episodes.add(table.column("episode_id")[0].as_py(), table)
+        episodes.add(table.column("episode_id")[0].as_py(), table, {"noise_std_m": NOISE_STD_M})
     columns, pieces = episodes.joined()
     rows = reading.rows(columns)
     return rows, classify(rows, pieces)
@@ -206,10 +208,12 @@ def make_learner() -> Callable[..., Learner]:
 
 
 @pytest.fixture(scope="session")
-def iterate() -> Callable[[Learner, list[pa.Table]], None]:
-    def run(learner: Learner, tables: list[pa.Table]) -> None:
+def iterate() -> Callable[..., None]:
+    def run(
+        learner: Learner, tables: list[pa.Table], noise_std_m: Callable[[pa.Table], float] = lambda _: NOISE_STD_M
+    ) -> None:
         for table in tables:
-            learner.add(table)
+            learner.add(table, noise_std_m(table))
         for phase in PHASES:
             assert all(0 <= done <= total for done, total in getattr(learner, phase.name)())
 

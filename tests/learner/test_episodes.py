@@ -64,12 +64,12 @@ def test_nothing_of_a_table_is_kept(
     lent = np.frombuffer(ipc.pack(table), dtype=np.uint8).copy()
     memory = weakref.ref(lent)
     (table,) = ipc.unpack(pa.py_buffer(lent), 1)
-    learner.add(table)
+    learner.add(table, 0.1)
     del table, lent
     gc.collect()
     assert memory() is None
     with pytest.raises(DataError, match=r"episode 0 was added twice in iteration 0"):
-        learner.add(tables[0])
+        learner.add(tables[0], 0.1)
 
 
 def test_episodes_that_cannot_be_learned_from_are_refused_by_their_number(

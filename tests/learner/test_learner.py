@@ -88,9 +88,9 @@ def test_phases_out_of_order_and_repeated_episodes_are_refused(
         list(learner.segment())
     with pytest.raises(RunError, match="segment"):
         list(learner.fit())
-    learner.add(tables[0])
+    learner.add(tables[0], 0.1)
     with pytest.raises(DataError, match="twice"):
-        learner.add(tables[0])
+        learner.add(tables[0], 0.1)
     with pytest.raises(RunError, match=r"supervise\(\) must come first"):
         learner.report()
 
@@ -187,7 +187,7 @@ CHANGES = {
 
 
 def test_every_setting_matters(tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate) -> None:
-    elsewhere = {"replay_iterations", "value_from"}  # below, and in test_value
+    elsewhere = {"replay_iterations", "value_from", "action_value"}  # below, and in test_action_value
     assert {*CHANGES, *elsewhere} == set(LearnerSettings.model_fields)
     results = []
     for change in [{}, *({name: value} for name, value in CHANGES.items())]:

@@ -5,7 +5,9 @@ from pathlib import Path
 from typing import get_args
 
 import pytest
+from pydantic import BaseModel
 
+from t6gps.learner.settings import ActionValueSettings
 from t6gps.service import config as configuration
 from t6gps.service.config import Config, differences, load, parse, presets
 from t6gps.storage.errors import ConfigError
@@ -49,6 +51,8 @@ def test_a_configuration_from_before_there_were_two_observations_means_the_senso
         ("learner.reduced_state=com", "learner", "reduced_state", "com"),
         ('learner.reduced_state="com"', "learner", "reduced_state", "com"),
         ("learner.hidden_layers=[8, 8]", "learner", "hidden_layers", (8, 8)),
+        ("learner.action_value.discount=0.9", "learner", "action_value", ActionValueSettings(discount=0.9)),
+        ("learner.action_value.hidden_layers=[8]", "learner", "action_value", ActionValueSettings(hidden_layers=(8,))),
     ],
 )
 def test_an_override_reaches_its_key(override: str, section: str, key: str, value: object) -> None:
@@ -69,6 +73,12 @@ def test_an_override_reaches_its_key(override: str, section: str, key: str, valu
         ("learner.reduced_state=knees", ["learner.reduced_state", "nodes+vels", "knees"]),
         ("run.seed", ["--set takes key=value", "run.seed"]),
         ("run.seed.deep=1", ["run.seed"]),
+        ("learner.action_value.discount=1", ["learner.action_value.discount", "less than 1", "found 1"]),
+        (
+            "learner.action_value.discont=1",
+            ["did you mean learner.action_value.discount?", "learner.action_value.batch"],
+        ),
+        ("learner.action_value=0.9", ["learner.action_value", "0.9"]),
     ],
 )
 def test_a_bad_override_is_refused_with_its_key_what_was_found_and_what_is_allowed(
@@ -105,10 +115,19 @@ def test_a_file_is_read_and_a_broken_one_refused(tmp_path: Path) -> None:
 
 
 def test_every_setting_says_what_it_is() -> None:
-    for section in Config.model_fields.values():
-        assert section.annotation is not None
-        for name, field in section.annotation.model_fields.items():
-            assert field.description, name
+    sections: list[type[BaseModel]] = [Config]
+    for section in sections:
+        for name, field in section.model_fields.items():
+            if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
+                sections.append(field.annotation)
+            else:
+                assert field.description, name
+
+
+def test_a_configuration_from_before_the_action_value_had_settings_means_their_defaults() -> None:
+    values = json.loads(Config().to_json())
+    del values["learner"]["action_value"], values["task"]["waypoint_radius_m"]
+    assert differences(configuration.parse(json.dumps(values)), Config()) == []
 
 
 def test_differences_name_the_key_and_both_values_and_ignore_the_number_of_workers() -> None:

@@ -1,7 +1,9 @@
 """Laws of the random streams."""
 
+from t6gps.learner.streams import Stream, branch
 from t6gps.service.config import load
-from t6gps.service.seeding import QUIET, evaluation_plans, training_plans
+from t6gps.service.seeding import QUIET, Branch, evaluation_plans, sequence, training_plans
+from t6gps.workers.episode import streams
 
 
 def test_plans_depend_on_configuration_and_iteration_alone() -> None:
@@ -23,6 +25,14 @@ def test_no_two_episodes_share_a_seed_or_an_id() -> None:
     seeds = [plan.seed for plan in plans + unseen] + [plan.terrain_seed for plan in plans + unseen]
     assert len(set(seeds)) == len(seeds)
     assert [plan.episode_id for plan in plans] == list(range(len(plans)))
+
+
+def test_no_two_branches_of_a_run_or_of_an_episode_draw_the_same_numbers() -> None:
+    of_run = {tuple(sequence(7, key).spawn_key) for key in Branch}
+    assert len(of_run) == len(Branch.__members__)
+    assert {branch(0, stream)[0] for stream in Stream} == {Branch.LEARNER}
+    drawn = [streams.generator(7, stream).random() for stream in streams.Stream]
+    assert len(set(drawn)) == len(drawn) == len(streams.Stream.__members__)
 
 
 def test_a_smaller_iteration_is_the_beginning_of_a_larger_one() -> None:

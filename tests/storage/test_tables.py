@@ -58,7 +58,7 @@ def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, rows: Any)
 def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_and_can_go_on(
     run: Run, commit: Any
 ) -> None:
-    later = {"iterations": 4, "classes": 3}
+    later = {"iterations": 5, "classes": 3}
     commit(run, 0)
     for name, n in later.items():
         rows = tables.read(run, name)
@@ -72,6 +72,35 @@ def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_a
             values = table.column(column).to_pylist()
             assert values[0] is None and values[-1] is not None
         assert table.column("cost" if name == "iterations" else "residual").null_count == 0
+
+
+def test_what_there_is_none_of_is_null_also_where_an_older_run_has_zero(run: Run, commit: Any, rows: Any) -> None:
+    """Version 4 allowed no null in these columns of a table that is there."""
+    iteration_row, class_rows = rows
+    none = {"iterations": ("cost_standard_error", "waypoints_per_episode"), "classes": ("modes", "residual")}
+    episodes = commit(run, 0)
+    for name, columns in none.items():
+        table = tables.read(run, name)
+        for column in columns:
+            place = table.schema.get_field_index(column)
+            table = table.set_column(place, table.schema.field(place).with_nullable(False), table.column(place))
+        shutil.rmtree(run.tables / name)
+        committed = CommitProperties(app_transactions=[Transaction("t6gps", 0)])
+        write_deltalake(run.tables / name, table, commit_properties=committed)
+    commit(run, 1)
+    iteration = iteration_row(2) | dict.fromkeys(none["iterations"])
+    classes = [row | dict.fromkeys(none["classes"]) for row in class_rows(2)]
+    numbered = pa.array([2], pa.int32()).take
+    later = [
+        table.set_column(1, table.schema.field(1), numbered(pa.array([0] * table.num_rows)))
+        for table in (episodes[0].frames, episodes[0].summary)
+    ]
+    tables.commit_iteration(run, 2, iter([Episode(*later)]), iteration, classes)
+    for name, columns in none.items():
+        table = tables.read(run, name).sort_by("iteration")
+        for column in columns:
+            values = table.column(column).to_pylist()
+            assert values[0] is not None and values[-1] is None
 
 
 def test_columns_and_rows_can_be_chosen(run: Run, commit: Any) -> None:

@@ -190,7 +190,7 @@ def _summary(
         "forward_speed_m_per_s": float(motion.forward_speed[moved].mean()),
         "stuck_share": float((motion.speed[moved] < STUCK_SPEED_M_PER_S).mean()),
         "stuck_share_by_distance": stuck_share_by_distance(motion.com),
-        "waypoints_reached": outcome.waypoints_reached,
+        "waypoints_reached": None if settings.task.directions is not None else outcome.waypoints_reached,
         "path_length_m": float(np.hypot(*np.diff(motion.com[:, :2], axis=0).T).sum()),
         "transitions": int(np.count_nonzero(np.diff(faces))),
         "bar_mass_kg": settings.robot.bar_mass_kg,

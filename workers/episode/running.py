@@ -9,15 +9,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from t6gps.workers.episode.start import random_start, rest_start
+from t6gps.workers.episode.streams import Stream, generator
 from t6gps.workers.episode.task import Course, one_direction, random_waypoints
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine, Unique
 from t6gps.workers.physics.observer import observe, survey
 from t6gps.workers.robot.support import SupportFrame, enter
 from t6gps.workers.settings import RolloutSettings
-
-SENSOR_STREAM = 4
-"""Branch of an episode's seed; start, course and exploration come first, then the robot (`worker`)."""
 
 
 class RunningEpisode(Unique):
@@ -47,13 +45,15 @@ class RunningEpisode(Unique):
         number: int = 0,
     ) -> None:
         robot, task = settings.robot, settings.task
-        start_rng, course_rng, self.noise_rng = np.random.default_rng(seed).spawn(3)
+        start_rng, course_rng, self.noise_rng = (
+            generator(seed, stream) for stream in (Stream.START, Stream.COURSE, Stream.EXPLORATION)
+        )
         terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
         engine.set_ground(terrain)
         self._engine = engine
         self._sensor_noise = settings.randomisation.sensor_noise
         if self._sensor_noise:
-            self._sensor_rng = np.random.default_rng(np.random.SeedSequence(seed, spawn_key=(SENSOR_STREAM,)))
+            self._sensor_rng = generator(seed, Stream.SENSORS)
         self._nominal_m = nominal_m
         self._step = 0
         if task.directions is not None:

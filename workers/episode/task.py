@@ -7,13 +7,9 @@ from math import cos, hypot, pi, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.workers.robot.topology import NODES_M
 from t6gps.workers.settings import TaskSettings
 
 Array = NDArray[np.float64]
-
-WAYPOINT_RADIUS_M = float(np.linalg.norm(NODES_M[0]))
-"""Half the diameter of the vehicle: the distance of a node from the centre in the neutral shape."""
 
 AREA_HALF_WIDTH_M = 15.0
 """Waypoints lie within this distance of the origin along x and along y, away from the edge of the ground."""
@@ -53,7 +49,7 @@ class Course:
 
     def __init__(self, waypoints: Array, settings: TaskSettings) -> None:
         self._waypoints = [(float(x), float(y)) for x, y in waypoints]
-        self._timeout_s = settings.waypoint_timeout_s
+        self._radius_m, self._timeout_s = settings.waypoint_radius_m, settings.waypoint_timeout_s
         self._since_s = 0.0
         self.active = self.reached = 0
 
@@ -63,7 +59,7 @@ class Course:
         x, y (m) is the place of the centre of mass.
         """
         waypoint = waypoint_x, waypoint_y = self.waypoint()
-        arrived = hypot(waypoint_x - x, waypoint_y - y) <= WAYPOINT_RADIUS_M
+        arrived = hypot(waypoint_x - x, waypoint_y - y) <= self._radius_m
         if not arrived and time_s - self._since_s < self._timeout_s - 1e-9:
             return waypoint
         self.reached += arrived

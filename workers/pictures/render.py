@@ -23,7 +23,6 @@ from PIL import Image, ImageDraw, ImageFont
 
 from t6gps.storage import durable
 from t6gps.storage.errors import ConfigError
-from t6gps.workers.episode.task import WAYPOINT_RADIUS_M
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures import scene as scenes
 from t6gps.workers.pictures.raycast import (
@@ -37,6 +36,7 @@ from t6gps.workers.pictures.raycast import (
 )
 from t6gps.workers.pictures.scene import CABLE, POLE, TRACK, Rods, Scene
 from t6gps.workers.robot.topology import FACES
+from t6gps.workers.settings import HALF_DIAMETER_M
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -97,19 +97,27 @@ BEYOND_M = np.float32(1000.0)
 """Depth of a ray that meets nothing."""
 
 
-def still(frames: pa.Table, terrain: Terrain | None, step: int, size: tuple[int, int] = STILL_SIZE) -> Picture:
+def still(
+    frames: pa.Table,
+    terrain: Terrain | None,
+    step: int,
+    size: tuple[int, int] = STILL_SIZE,
+    waypoint_radius_m: float = HALF_DIAMETER_M,
+) -> Picture:
     """Picture [h, w, 3] of row `step` of an episode's frames on its ground (None: flat).
 
     ConfigError if the episode has no such row.
     """
     _check_steps(frames, [step])
-    return _draw(scenes.build(frames, terrain, [step]), step, size, STILL_SAMPLES)
+    return _draw(scenes.build(frames, terrain, [step], waypoint_radius_m), step, size, STILL_SAMPLES)
 
 
-def snapshots(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Picture:
+def snapshots(
+    frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], waypoint_radius_m: float = HALF_DIAMETER_M
+) -> Picture:
     """Pictures of several rows in one, from left to right and from top to bottom. ConfigError as for `still`."""
     _check_steps(frames, steps)
-    scene = scenes.build(frames, terrain, steps)
+    scene = scenes.build(frames, terrain, steps, waypoint_radius_m)
     columns = min(len(steps), STRIP_COLUMNS)
     width, height = PANEL_SIZE[0] + STRIP_GAP, PANEL_SIZE[1] + STRIP_GAP
     sheet = np.full((-(-len(steps) // columns) * height - STRIP_GAP, columns * width - STRIP_GAP, 3), 255, np.uint8)
@@ -119,10 +127,16 @@ def snapshots(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -
     return sheet
 
 
-def film(frames: pa.Table, terrain: Terrain | None, path: Path, progress: Progress | None = None) -> None:
+def film(
+    frames: pa.Table,
+    terrain: Terrain | None,
+    path: Path,
+    progress: Progress | None = None,
+    waypoint_radius_m: float = HALF_DIAMETER_M,
+) -> None:
     """Write all rows as an mp4 film in real time, ten pictures a second; `progress(done, total)` follows them."""
     steps = range(frames.num_rows)
-    scene = scenes.build(frames, terrain, steps)
+    scene = scenes.build(frames, terrain, steps, waypoint_radius_m)
     writer = imageio_ffmpeg.write_frames(
         str(path),
         FILM_SIZE,
@@ -156,6 +170,7 @@ def render(
     step: int | None = None,
     strip: int | None = None,
     progress: Progress | None = None,
+    waypoint_radius_m: float = HALF_DIAMETER_M,
 ) -> None:
     """Write a film (`out` ends in .mp4) or a picture (.png) of an episode's frames on its ground (None: flat).
 
@@ -175,12 +190,14 @@ def render(
     draft = durable.hidden(out)
     try:
         if out.suffix == ".mp4":
-            film(frames, terrain, draft, progress)
+            film(frames, terrain, draft, progress, waypoint_radius_m)
         else:
             if strip is None:
-                picture = still(frames, terrain, rows // 2 if step is None else step)
+                chosen = rows // 2 if step is None else step
+                picture = still(frames, terrain, chosen, waypoint_radius_m=waypoint_radius_m)
             else:
-                picture = snapshots(frames, terrain, np.linspace(0, rows - 1, strip).round().astype(int).tolist())
+                steps = np.linspace(0, rows - 1, strip).round().astype(int).tolist()
+                picture = snapshots(frames, terrain, steps, waypoint_radius_m)
             Image.fromarray(picture).save(draft, format="png")
         durable.publish(out)
     except OSError as error:
@@ -268,7 +285,7 @@ def _paint(scene: Scene, step: int, x: Floats, y: Floats, pixel: Floats, albedo:
     middle = corners.mean(axis=0)
     reach = float(np.hypot(*(corners - middle).T).max())
     for centre, radius, triangle, colour, fill in (
-        (scene.waypoint[step], WAYPOINT_RADIUS_M, None, WAYPOINT_COLOUR, 0.3),
+        (scene.waypoint[step], scene.waypoint_radius_m, None, WAYPOINT_COLOUR, 0.3),
         (middle, reach, corners - middle, TRIANGLE_COLOURS[scene.kind[step]], 0.55),
     ):
         across, along = x - float(centre[0]), y - float(centre[1])

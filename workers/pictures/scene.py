@@ -15,7 +15,7 @@ from t6gps.workers.pictures.landscape import Landscape
 from t6gps.workers.pictures.raycast import Camera
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.topology import BARS, BARS_N, CABLES, CABLES_N
-from t6gps.workers.settings import RobotSettings
+from t6gps.workers.settings import HALF_DIAMETER_M, RobotSettings
 
 Array = NDArray[np.float64]
 Ints = NDArray[np.int64]
@@ -98,6 +98,7 @@ class Scene:
     face: Ints
     kind: Ints
     waypoint: Array
+    waypoint_radius_m: float
     time_s: Array
     forward_speed_m_per_s: Array
 
@@ -142,7 +143,9 @@ class Scene:
         return np.column_stack([x, y, self.landscape.height(x, y) + 0.01])
 
 
-def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Scene:
+def build(
+    frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], waypoint_radius_m: float = HALF_DIAMETER_M
+) -> Scene:
     """The scene of an episode's `frames` on its ground (None: flat), seen from where the rows `steps` are seen best."""
     positions, orientations = (
         np.asarray(schema.array(frames, name), dtype=np.float64).reshape(-1, BARS_N, n)
@@ -170,6 +173,7 @@ def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Sc
         face=np.asarray(schema.array(frames, "face"), dtype=np.int64),
         kind=np.asarray(schema.array(frames, "kind"), dtype=np.int64),
         waypoint=waypoint,
+        waypoint_radius_m=waypoint_radius_m,
         time_s=time_s,
         forward_speed_m_per_s=_numbers(frames, "forward_speed_m_per_s"),
     )

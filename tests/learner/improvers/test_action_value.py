@@ -17,7 +17,7 @@ from t6gps.learner.improvers.action_value import ActionValue
 from t6gps.learner.improvers.transitions import MOVED, Filed, Held, Transitions, joined
 from t6gps.learner.learner import Learner
 from t6gps.learner.rows import Floats
-from t6gps.learner.settings import LearnerSettings, Localization
+from t6gps.learner.settings import ActionValueSettings, LearnerSettings, Localization
 from t6gps.storage import schema
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
@@ -68,7 +68,7 @@ def policys_commands(known: Transitions) -> Floats:
 
 
 def learned(known: Transitions) -> ActionValue:
-    value = ActionValue(2.0, 0.1, np.random.default_rng(3))
+    value = ActionValue(ActionValueSettings(), 2.0, 0.1, np.random.default_rng(3))
     value.add(known)
     steps_n = value.steps_n
     assert sum(1 for _ in value.learn(untrained(), np.random.default_rng(4))) == steps_n
@@ -219,18 +219,16 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    for name in ("STEPS", "FIRST_STEPS"):
-        monkeypatch.setattr(action_value, name, 30)
-    monkeypatch.setattr(action_value, "REMEMBERED_N", 2)
+    led_by = {"value_from": 1, "action_value": ActionValueSettings(steps=30, first_steps=30, remembered_iterations=2)}
     moving = [with_motion(table, number) for number, table in enumerate(tables)]
     kept: dict[int, list[pa.Table]] = {}
     monkeypatch.setattr(
         "t6gps.storage.tables.frames_of",
         lambda run, iteration, columns: {n: table.select(columns) for n, table in enumerate(kept[iteration])},
     )
-    plain, led = make_learner(), make_learner(value_from=1)
+    plain, led = make_learner(), make_learner(**led_by)
     for iteration in range(4):
-        resumed = make_learner(value_from=1)
+        resumed = make_learner(**led_by)
         resumed.restore(*led.state())
         resumed.recall(None)  # type: ignore[arg-type]  # the tables above stand for those of a run
         for learner in (plain, led, resumed):
@@ -239,6 +237,39 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
         assert same(led.state()[1], resumed.state()[1])
         differs = not np.array_equal(plain.snapshot.layers[0][0], led.snapshot.layers[0][0])
         assert differs == (iteration >= 1)
+
+
+SMALL = {"hidden_layers": (8,), "batch": 16, "steps": 3, "first_steps": 5}
+CHANGES = {
+    "remembered_iterations": 1, "discount": 0.5, "hidden_layers": (9,), "batch": 17, "steps": 4, "first_steps": 6,
+    "learning_rate": 2e-3, "weight_decay": 0.5, "target_rate": 0.5, "own_heading_share": 1.0, "step_weight": 0.1,
+    "ascents": 2, "ascent_rate": 0.25,
+}  # fmt: skip
+
+
+def climbed(settings: ActionValueSettings) -> bytes:
+    """Actions that two iterations of learning lead to."""
+    value = ActionValue(settings, 2.0, 0.1, np.random.default_rng(3))
+    for seed in range(2):
+        value.add(planted(seed))
+        assert sum(1 for _ in value.learn(untrained(), np.random.default_rng(seed))) == (
+            settings.steps if seed else settings.first_steps
+        )
+    return value.improved(untrained()).tobytes()
+
+
+def test_every_setting_of_the_action_value_matters() -> None:
+    assert set(CHANGES) == set(ActionValueSettings.model_fields)
+    changed = [climbed(ActionValueSettings(**SMALL | {name: value})) for name, value in CHANGES.items()]
+    assert len({climbed(ActionValueSettings(**SMALL)), *changed}) == 1 + len(CHANGES)
+
+
+def test_gradient_steps_need_not_fill_what_is_prepared_at_once() -> None:
+    value = ActionValue(
+        ActionValueSettings(hidden_layers=(4,), batch=4, first_steps=37), 2.0, 0.1, np.random.default_rng(3)
+    )
+    value.add(planted(0))
+    assert sum(1 for _ in value.learn(untrained(), np.random.default_rng(0))) == 37
 
 
 def test_the_value_knows_no_world_axes() -> None:

@@ -41,7 +41,13 @@ def test_a_finished_run_has_data_checkpoints_and_figures(tiny: Trained) -> None:
 
 def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
     result = json.loads(t6gps("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", root).stdout)
-    for key in ("forward_speed_m_per_s", "stuck_share", "stuck_share_by_distance", "waypoints_per_episode", "cost"):
+    for key in (
+        "forward_speed_m_per_s",
+        "stuck_share_by_distance",
+        "stuck_share_by_speed",
+        "waypoints_per_episode",
+        "cost",
+    ):
         assert set(result[key]) == {"mean", "standard_error"}
 
 

@@ -165,7 +165,9 @@ def test_the_folder_holds_tables_figures_and_how_they_were_made(
     for outcome in finished:
         mean = outcome.evaluation.forward_speed_m_per_s.mean
         assert float(rows[outcome.trial.arm]["forward_speed_m_per_s"]) == pytest.approx(mean)
-        assert rows[outcome.trial.arm]["forward_speed_m_per_s_deviation"] == ""
+        assert rows[outcome.trial.arm]["forward_speed_m_per_s_deviation"] == "", "one seed has none"
+        steps = tables.read(outcome.run, "iterations", ["steps"])["steps"].to_pylist()
+        assert float(rows[outcome.trial.arm]["steps"]) == sum(steps), "what was sampled, not what was planned"
     page = (tmp_path / "out" / "README.md").read_text()
     for words in (PAIR.question, "    t6gps study pair", "seeds 0", finished[0].origin.commits[0], "wall time"):
         assert words in page

@@ -56,7 +56,7 @@ def rows(episodes: dict[int, pa.Table]) -> Rows:
     reading = standard_gps.InWorld(CABLE_MAP)
     taken = Episodes([reading], STEPS)
     for number, frames in reversed(episodes.items()):
-        taken.add(number, frames)
+        taken.add(number, frames, {"noise_std_m": 0.15})
     return reading.rows(taken.joined()[0])
 
 
@@ -89,7 +89,7 @@ def test_every_direction_is_a_class_and_every_time_step_a_model(
     assert (rows.exit == NONE).all()
     learner = new_learner(config)
     for frames in episodes.values():
-        learner.add(frames)
+        learner.add(frames, 0.15)
     for phase in PHASES:
         list(getattr(learner, phase.name)())
     report, classes = learner.report()

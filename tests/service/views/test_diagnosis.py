@@ -10,7 +10,7 @@ from t6gps.service.config import parse
 from t6gps.service.views.diagnosis import diagnose
 
 HEALTHY = {
-    "cost_standard_error": 0.01, "forward_speed_m_per_s": 0.45, "stuck_share": 0.01, "modes": 1.2,
+    "cost_standard_error": 0.01, "forward_speed_m_per_s": 0.45, "stuck_share_by_distance": 0.01, "modes": 1.2,
     "predicted_cost_change": -0.2, "supervised_loss_before": 0.2, "supervised_loss": 0.15, "policy_kl": 0.8,
     "saturated_share": 0.02,
 }  # fmt: skip
@@ -49,7 +49,7 @@ PLANTED = {
     "step was too large": (iterations((1.0, 0.43, 0.5, 0.36)), classes(), "from 0.430 to 0.500"),
     "Learning has stopped": (iterations((1.0, 0.43, 0.42, 0.435)), classes(), "-0.400"),
     "goes nowhere": (iterations(forward_speed_m_per_s=0.02), classes(), "0.020 m/s"),
-    "stands still": (iterations(stuck_share=0.4), classes(), "40%"),
+    "stands still": (iterations(stuck_share_by_distance=0.4), classes(), "40%"),
     "policy is saturated": (iterations(saturated_share=0.31), classes(), "31%"),
     "does not take up": (iterations(supervised_loss=0.196), classes(), "from 0.200 to 0.196"),
     "Classes are starved": (iterations(), classes(pooled_rows=850), "50%"),
@@ -96,7 +96,7 @@ def test_a_rise_within_two_standard_errors_is_chance() -> None:
 
 
 def test_columns_that_older_runs_lack_say_nothing() -> None:
-    missing = dict.fromkeys(("supervised_loss_before", "policy_kl", "saturated_share"))
+    missing = dict.fromkeys(("supervised_loss_before", "policy_kl", "saturated_share", "stuck_share_by_distance"))
     rows = [row | missing for row in iterations()]
     assert diagnose(rows, classes())[0].startswith("All well")
     rising = [row | missing for row in iterations((1.0, 0.43, 0.5, 0.36))]
@@ -104,4 +104,4 @@ def test_columns_that_older_runs_lack_say_nothing() -> None:
 
 
 def test_several_troubles_are_all_named() -> None:
-    assert len(diagnose(iterations(saturated_share=0.5, stuck_share=0.5), classes(pooled_rows=900))) == 3
+    assert len(diagnose(iterations(saturated_share=0.5, stuck_share_by_distance=0.5), classes(pooled_rows=900))) == 3

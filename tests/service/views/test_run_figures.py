@@ -15,11 +15,10 @@ from matplotlib.patches import Circle
 
 from t6gps.service.views import run_figures
 from t6gps.storage import catalog, schema, tables
-from t6gps.workers.episode.task import WAYPOINT_RADIUS_M
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
 from t6gps.workers.robot.topology import DELTA, FACES
-from t6gps.workers.settings import TerrainSettings
+from t6gps.workers.settings import HALF_DIAMETER_M, RolloutSettings, TaskSettings
 
 
 def _table(name: str, rows: list[dict[str, Any]]) -> pa.Table:
@@ -65,11 +64,13 @@ def _lines(figure: Figure, panel: int = 0) -> list[np.ndarray]:
 def test_learning_curves_hold_means_and_standard_errors() -> None:
     rows = [
         {"iteration": i, "cost": 1 - 0.1 * i, "cost_standard_error": 0.05, "forward_speed_m_per_s": 0.2 * i,
-         "forward_speed_standard_error": 0.03, "stuck_share": 0.5 / (i + 1)}
+         "forward_speed_standard_error": 0.03, "stuck_share_by_distance": 0.5 / (i + 1)}
         for i in range(4)
     ]  # fmt: skip
     figure = run_figures.learning(_table("iterations", rows))
-    for panel, (name, scale) in enumerate((("cost", 1), ("forward_speed_m_per_s", 1), ("stuck_share", 100))):
+    for panel, (name, scale) in enumerate(
+        (("cost", 1), ("forward_speed_m_per_s", 1), ("stuck_share_by_distance", 100))
+    ):
         expected = [(row["iteration"], scale * row[name]) for row in rows]
         np.testing.assert_allclose(_lines(figure, panel)[0], expected)
     band = figure.axes[0].collections[0].get_paths()[0].vertices
@@ -85,14 +86,15 @@ def test_the_ground_track_shows_the_episode_of_median_speed(difficulty: float) -
         {"episode_id": i, "forward_speed_m_per_s": speed, "terrain_difficulty": difficulty, "terrain_seed": i % 2}
         for i, speed in enumerate(speeds)
     ]
-    figure = run_figures.ground_track(frames, _table("episodes", summary), TerrainSettings())
+    settings = RolloutSettings(task=TaskSettings(waypoint_radius_m=0.3))
+    figure = run_figures.ground_track(frames, _table("episodes", summary), settings)
     tracks = [line for line in _lines(figure) if len(line) == 5]
     drawn = {int(track[0, 1]) for track in tracks}
     assert drawn == ({0, 1, 2} if difficulty == 0 else {0, 2}), "others only on the same ground"
     np.testing.assert_array_equal(tracks[-1], [(step, 2.0) for step in range(5)])
     circles = [patch for patch in figure.axes[0].patches if isinstance(patch, Circle)]
     assert [circle.center for circle in circles] == [(0, 2), (4, 3), (2, 3)]
-    assert {circle.radius for circle in circles} == {WAYPOINT_RADIUS_M}
+    assert [circle.radius for circle in circles] == [HALF_DIAMETER_M, 0.3, 0.3]
 
 
 def test_ground_that_is_level_where_the_robot_went_has_no_contours() -> None:
@@ -134,7 +136,7 @@ def test_paths_of_two_episodes_are_not_joined() -> None:
 
 
 def test_a_run_without_iterations_has_no_figures(tmp_path: Path) -> None:
-    assert run_figures.draw(catalog.create(tmp_path, "run", "{}"), TerrainSettings()) == []
+    assert run_figures.draw(catalog.create(tmp_path, "run", "{}"), RolloutSettings()) == []
 
 
 def test_figures_show_the_last_iteration_and_are_written_whole(tmp_path: Path, make_episode: Any) -> None:
@@ -144,7 +146,7 @@ def test_figures_show_the_last_iteration_and_are_written_whole(tmp_path: Path, m
         classes = _table("classes", [{"iteration": iteration, "segments": 3}]).to_pylist()
         episodes = [_sound(make_episode(iteration, iteration), iteration)]
         tables.commit_iteration(run, iteration, episodes, row, classes)
-    drawn = run_figures.draw(run, TerrainSettings())
+    drawn = run_figures.draw(run, RolloutSettings())
     assert drawn == [run.figures / f"{name}.png" for name in ("learning", "ground_track", "segments")]
     assert sorted(run.figures.iterdir()) == sorted(drawn)
     assert all(path.read_bytes().startswith(b"\x89PNG") for path in drawn)

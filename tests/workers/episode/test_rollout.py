@@ -18,13 +18,13 @@ from t6gps.workers.episode import policy
 from t6gps.workers.episode.exploration import noise
 from t6gps.workers.episode.recording import canonical_vectors, stuck_share_by_distance
 from t6gps.workers.episode.start import SETTLE_STEPS
-from t6gps.workers.episode.task import AREA_HALF_WIDTH_M, WAYPOINT_RADIUS_M, Course, random_waypoints, running_cost
+from t6gps.workers.episode.task import AREA_HALF_WIDTH_M, Course, random_waypoints, running_cost
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.engine import Engine
 from t6gps.workers.robot.state import Array, RobotState
 from t6gps.workers.robot.symmetry import CABLES_FROM, NODE_MAP, NODES_FROM, world_map
-from t6gps.workers.robot.topology import NEIGHBOR_FACE
+from t6gps.workers.robot.topology import NEIGHBOR_FACE, NODES_M
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings
 from t6gps.workers.worker import RolloutWorker
 
@@ -179,8 +179,10 @@ def test_rocking_on_the_spot_is_stuck_by_distance_and_rolling_is_not() -> None:
 def test_with_directions_every_episode_starts_at_the_same_rest_and_heads_one_way() -> None:
     settings = RolloutSettings(task=TaskSettings(directions=4))
     worker, policy = RolloutWorker(settings), random_policy()
-    episodes = [worker.run(replace(PLAN, steps=3, seed=10 + i, index=i), policy).frames for i in range(5)]
+    sampled = [worker.run(replace(PLAN, steps=3, seed=10 + i, index=i), policy) for i in range(5)]
     worker.close()
+    episodes = [episode.frames for episode in sampled]
+    assert {episode.summary["waypoints_reached"][0].as_py() for episode in sampled} == {None}, "there are none to reach"
     starts = [np.concatenate([schema.array(e, n)[0] for n in ("bar_positions", "bar_orientations")]) for e in episodes]
     for start in starts:
         np.testing.assert_array_equal(start, starts[0])
@@ -219,13 +221,23 @@ def test_waypoints_form_a_chain_within_the_area() -> None:
 
 
 def test_the_next_waypoint_comes_on_arrival_or_after_five_seconds() -> None:
-    course = Course(np.array([[3.0, 0.0], [6.0, 0.0]]), TaskSettings(waypoints=2))
+    settings = TaskSettings(waypoints=2)
+    course = Course(np.array([[3.0, 0.0], [6.0, 0.0]]), settings)
     for step in range(50):
         assert course.advance(0.0, 0.0, step * 0.1) == (3.0, 0.0)
     assert course.advance(0.0, 0.0, 5.0) == (6.0, 0.0)
     assert course.reached == 0
-    assert course.advance(6.0, WAYPOINT_RADIUS_M - 1e-9, 5.1) == (3.0, 0.0)
+    assert course.advance(6.0, settings.waypoint_radius_m - 1e-9, 5.1) == (3.0, 0.0)
     assert (course.reached, course.active) == (1, 2)
+
+
+def test_a_waypoint_is_reached_within_its_radius_which_is_half_the_robots_diameter_by_default() -> None:
+    assert TaskSettings().waypoint_radius_m == np.linalg.norm(NODES_M[0])
+    for radius_m in (0.5, 2.0):
+        for place_m, reached in ((radius_m + 1e-9, 0), (radius_m - 1e-9, 1)):
+            course = Course(np.array([[0.0, 0.0], [9.0, 9.0]]), TaskSettings(waypoint_radius_m=radius_m))
+            course.advance(0.0, place_m, 0.1)
+            assert (course.reached, course.active) == (reached, reached)
 
 
 def test_the_cost_vanishes_at_the_target_velocity_and_weighs_the_vertical_less() -> None:
