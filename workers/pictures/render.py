@@ -35,7 +35,7 @@ from t6gps.workers.pictures.raycast import (
     cast_shadow,
     look_up,
 )
-from t6gps.workers.pictures.scene import CABLE, POLE, TRACK, Rods, Scene
+from t6gps.workers.pictures.scene import BAR_RADIUS_M, CABLE, POLE, TRACK, Rods, Scene
 from t6gps.workers.robot.topology import FACES
 
 Array = NDArray[np.float64]
@@ -97,19 +97,27 @@ BEYOND_M = np.float32(1000.0)
 """Depth of a ray that meets nothing."""
 
 
-def still(frames: pa.Table, terrain: Terrain | None, step: int, size: tuple[int, int] = STILL_SIZE) -> Picture:
+def still(
+    frames: pa.Table,
+    terrain: Terrain | None,
+    step: int,
+    size: tuple[int, int] = STILL_SIZE,
+    bar_radius_m: float = BAR_RADIUS_M,
+) -> Picture:
     """Picture [h, w, 3] of row `step` of an episode's frames on its ground (None: flat).
 
     ConfigError if the episode has no such row.
     """
     _check_steps(frames, [step])
-    return _draw(scenes.build(frames, terrain, [step]), step, size, STILL_SAMPLES)
+    return _draw(scenes.build(frames, terrain, [step], bar_radius_m), step, size, STILL_SAMPLES)
 
 
-def snapshots(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Picture:
+def snapshots(
+    frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], bar_radius_m: float = BAR_RADIUS_M
+) -> Picture:
     """Pictures of several rows in one, from left to right and from top to bottom. ConfigError as for `still`."""
     _check_steps(frames, steps)
-    scene = scenes.build(frames, terrain, steps)
+    scene = scenes.build(frames, terrain, steps, bar_radius_m)
     columns = min(len(steps), STRIP_COLUMNS)
     width, height = PANEL_SIZE[0] + STRIP_GAP, PANEL_SIZE[1] + STRIP_GAP
     sheet = np.full((-(-len(steps) // columns) * height - STRIP_GAP, columns * width - STRIP_GAP, 3), 255, np.uint8)
@@ -119,10 +127,16 @@ def snapshots(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -
     return sheet
 
 
-def film(frames: pa.Table, terrain: Terrain | None, path: Path, progress: Progress | None = None) -> None:
+def film(
+    frames: pa.Table,
+    terrain: Terrain | None,
+    path: Path,
+    bar_radius_m: float = BAR_RADIUS_M,
+    progress: Progress | None = None,
+) -> None:
     """Write all rows as an mp4 film in real time, ten pictures a second; `progress(done, total)` follows them."""
     steps = range(frames.num_rows)
-    scene = scenes.build(frames, terrain, steps)
+    scene = scenes.build(frames, terrain, steps, bar_radius_m)
     writer = imageio_ffmpeg.write_frames(
         str(path),
         FILM_SIZE,
@@ -155,13 +169,14 @@ def render(
     *,
     step: int | None = None,
     strip: int | None = None,
+    bar_radius_m: float = BAR_RADIUS_M,
     progress: Progress | None = None,
 ) -> None:
     """Write a film (`out` ends in .mp4) or a picture (.png) of an episode's frames on its ground (None: flat).
 
-    A picture shows row `step`, the middle one by default, or `strip` rows spread evenly over the episode. The
-    file appears whole or not at all. ConfigError for another suffix, a missing folder, a row that the episode does
-    not have, or options that do not go together.
+    The robot's bars have the radius `bar_radius_m`. A picture shows row `step`, the middle one by default, or `strip`
+    rows spread evenly over the episode. The file appears whole or not at all. ConfigError for another suffix, a missing
+    folder, a row that the episode does not have, or options that do not go together.
     """
     rows = frames.num_rows
     if out.suffix not in (".png", ".mp4"):
@@ -175,12 +190,14 @@ def render(
     draft = durable.hidden(out)
     try:
         if out.suffix == ".mp4":
-            film(frames, terrain, draft, progress)
+            film(frames, terrain, draft, bar_radius_m, progress)
         else:
             if strip is None:
-                picture = still(frames, terrain, rows // 2 if step is None else step)
+                chosen = rows // 2 if step is None else step
+                picture = still(frames, terrain, chosen, bar_radius_m=bar_radius_m)
             else:
-                picture = snapshots(frames, terrain, np.linspace(0, rows - 1, strip).round().astype(int).tolist())
+                spread = np.linspace(0, rows - 1, strip).round().astype(int).tolist()
+                picture = snapshots(frames, terrain, spread, bar_radius_m)
             Image.fromarray(picture).save(draft, format="png")
         durable.publish(out)
     except OSError as error:

@@ -51,7 +51,7 @@ BAR, CAP, CABLE, POLE, TRACK = range(5)
 """Parts, in the order of render.ROD_COLOURS."""
 
 BAR_RADIUS_M = RobotSettings().bar_radius_m
-"""The usual one: recorded rows do not tell the robot's own."""
+"""The usual one."""
 
 CAP_LENGTH_M = 0.07
 """Of the coloured ends of a bar."""
@@ -86,7 +86,8 @@ class Rods:
 class Scene:
     """An episode on its ground, seen in the fixed horizontal direction `forward` [2] from `eyes` [T + 1, 3] (m).
 
-    com [T + 1, 3], nodes [T + 1, 12, 3], waypoint [T + 1, 2] (m); `sun` is the unit vector to the sun.
+    com [T + 1, 3], nodes [T + 1, 12, 3], waypoint [T + 1, 2] (m); `sun` is the unit vector to the sun. `bar_radius_m`
+    is that of the robot's bars.
     """
 
     landscape: Landscape
@@ -100,6 +101,7 @@ class Scene:
     waypoint: Array
     time_s: Array
     forward_speed_m_per_s: Array
+    bar_radius_m: float
 
     def camera(self, step: int, size: tuple[int, int]) -> Camera:
         """The camera of a row, for pictures of `size` (width, height) in rays."""
@@ -119,8 +121,8 @@ class Scene:
         top = foot + [0.0, 0.0, FLAG_HEIGHT_M]
         point = np.array([0.0, 0.0, 1e-4])  # a rod needs some length, even where the robot has not moved
         pieces = (
-            (first, second, 0.8 * BAR_RADIUS_M, BAR),
-            (ends, caps, 1.1 * BAR_RADIUS_M, CAP),
+            (first, second, 0.8 * self.bar_radius_m, BAR),
+            (ends, caps, 1.1 * self.bar_radius_m, CAP),
             (nodes[CABLES[:, 0]], nodes[CABLES[:, 1]], CABLE_RADIUS_M, CABLE),
             (foot, top, POLE_RADIUS_M, POLE),
             (top, top + point, BALL_RADIUS_M, TRACK),
@@ -142,7 +144,7 @@ class Scene:
         return np.column_stack([x, y, self.landscape.height(x, y) + 0.01])
 
 
-def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Scene:
+def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], bar_radius_m: float = BAR_RADIUS_M) -> Scene:
     """The scene of an episode's `frames` on its ground (None: flat), seen from where the rows `steps` are seen best."""
     positions, orientations = (
         np.asarray(schema.array(frames, name), dtype=np.float64).reshape(-1, BARS_N, n)
@@ -172,6 +174,7 @@ def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int]) -> Sc
         waypoint=waypoint,
         time_s=time_s,
         forward_speed_m_per_s=_numbers(frames, "forward_speed_m_per_s"),
+        bar_radius_m=bar_radius_m,
     )
 
 
