@@ -33,7 +33,7 @@ from t6gps.storage import durable
 from t6gps.storage.errors import RunError
 
 NAME_LENGTH_N = 64
-GLANCE_S = 1.0
+GLANCE_S = 0.5
 """Somebody who only looks whether a run is in use holds its lock for less."""
 NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)

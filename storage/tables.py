@@ -168,8 +168,11 @@ def _files(run: Run, table: str, iterations_n: int) -> list[str]:
             if not file.is_file() or file.stat().st_size != size:
                 found = f"{file.stat().st_size}" if file.is_file() else "none"
                 raise _damaged(run, table, f"{file.name} has {size} bytes, found {found}")
-    if not iterations_n <= _committed(delta) == len(sizes):
-        raise _damaged(run, table, f"its log has {len(sizes)} of {max(iterations_n, _committed(delta))} iterations")
+    committed_n = _committed(delta)
+    if len(sizes) < max(iterations_n, committed_n):
+        raise _damaged(run, table, f"its log has {len(sizes)} of {max(iterations_n, committed_n)} iterations")
+    if committed_n > iterations_n + 1 and committed_iterations(run) == iterations_n:
+        raise _damaged(run, "episodes", f"its log has {iterations_n} of {committed_n - 1} iterations or more")
     return [str(file) for file in sizes]
 
 
