@@ -68,10 +68,8 @@ def runs(root: Root = DEFAULT_ROOT) -> None:
 
 def _summary(run: Run) -> dict[str, object]:
     """A run in a line. An error where something of it cannot be read."""
-    planned, _ = configuration.kept(run).run.iterations, origin.configured(run)
-    tables.files(run)
+    planned, done = origin.configured(run).run.iterations, tables.files(run)[0]
     last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
-    done = tables.committed_iterations(run)
     known = {key: last[0][key] for key in SUMMARY[2:]} if last else dict.fromkeys(SUMMARY[2:])
     return {"run": run.name, "iterations": f"{done} of {planned}", **known}
 
@@ -79,7 +77,8 @@ def _summary(run: Run) -> dict[str, object]:
 def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
     """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
     run = catalog.open_run(root, run_name)
-    if not tables.committed_iterations(run):
+    origin.configured(run)  # an error for a run that is not whole
+    if not tables.files(run)[0]:
         typer.echo(f"run {run_name} has not finished an iteration yet")
         return
     print_learning(run)
