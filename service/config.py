@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from pydantic import BaseModel, Field, JsonValue, ValidationError, model_validator
 
 from t6gps.learner.settings import LearnerSettings, Localization
+from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
@@ -50,7 +51,7 @@ class RunSettings(Settings):
         return (self.workers_min, self.workers_max) if self.workers_max else None
 
 
-SPEED_ONLY = {"run.workers", "run.workers_min", "run.workers_max", "run.cpus_per_worker"}
+NO_EFFECT = {"run.workers", "run.workers_min", "run.workers_max", "run.cpus_per_worker", "terrain.accept"}
 """Keys that data do not depend on."""
 
 
@@ -82,12 +83,9 @@ def load(source: str, overrides: Sequence[str] = ()) -> Config:
     ConfigError if the source is unknown or not TOML, or a key or value is not allowed.
     """
     if source in presets():
-        text = (resources.files("t6gps.deploy") / "presets" / f"{source}.toml").read_text()
+        text = (resources.files("t6gps.deploy") / "presets" / f"{source}.toml").read_text(encoding="utf-8")
     elif source.endswith(".toml"):
-        try:
-            text = Path(source).read_text()
-        except (OSError, UnicodeDecodeError) as error:
-            raise ConfigError(f"cannot read the configuration file {source}: {error}; give an existing file") from None
+        text = _text(Path(source), "the configuration file", "give an existing file")
     else:
         raise ConfigError(
             f"unknown preset '{source}'{_nearest(source, presets())}; "
@@ -98,6 +96,27 @@ def load(source: str, overrides: Sequence[str] = ()) -> Config:
     except tomllib.TOMLDecodeError as error:
         raise ConfigError(f"{source} is not TOML: {error}; correct the file") from None
     return _checked_learner(_with_whole_paths(_validated(_overridden(values, overrides), source)), source)
+
+
+def kept(run: Run, overrides: Sequence[str] = ()) -> Config:
+    """The configuration that a run was created with, with overrides. ConfigError as for `load`."""
+    remedy = "restore the file from a copy"
+    return parse(
+        _text(run.config_path, f"the configuration of run {run.name},", remedy), overrides, str(run.config_path)
+    )
+
+
+def _text(path: Path, what: str, remedy: str) -> str:
+    """What a file of UTF-8 says, with or without a byte order mark. ConfigError for another encoding."""
+    try:
+        text = path.read_bytes().decode("utf-8-sig")
+    except OSError as error:
+        raise ConfigError(f"cannot read {what} {path}: {error.strerror}; {remedy}") from None
+    except UnicodeDecodeError as error:
+        raise ConfigError(f"{path} is not text in UTF-8: {error}; save it as UTF-8") from None
+    if "\0" in text:
+        raise ConfigError(f"{path} is not text in UTF-8: it has zeros, as UTF-16 does; save it as UTF-8")
+    return text
 
 
 def _checked_learner(config: Config, where: str) -> Config:
@@ -120,8 +139,15 @@ def _with_whole_paths(config: Config) -> Config:
     """The configuration with the whole path of its ground's file, so that a run finds it from any folder."""
     if config.terrain.file is None:
         return config
-    file = str(Path(config.terrain.file).resolve())
-    return config.model_copy(update={"terrain": config.terrain.model_copy(update={"file": file})})
+    try:
+        return with_ground(config, Path(config.terrain.file).expanduser().resolve())
+    except RuntimeError as error:
+        raise ConfigError(f"terrain.file = {config.terrain.file} leads nowhere: {error}; correct it") from None
+
+
+def with_ground(config: Config, file: Path) -> Config:
+    """The configuration with its ground in another file."""
+    return config.model_copy(update={"terrain": config.terrain.model_copy(update={"file": str(file)})})
 
 
 def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") -> Config:
@@ -129,8 +155,10 @@ def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") 
     try:
         values = json.loads(text)
     except json.JSONDecodeError as error:
-        raise ConfigError(f"{where} is not JSON: {error}; restore the file from a backup") from None
-    if isinstance(values, dict) and isinstance(values.get("learner"), dict):
+        raise ConfigError(f"{where} is not JSON: {error}; restore the file from a copy") from None
+    if not isinstance(values, dict):
+        raise ConfigError(f"{where} is not a configuration: found a {type(values).__name__}; restore it from a copy")
+    if isinstance(values.get("learner"), dict):
         values["learner"].setdefault("observation", "sensors")  # runs of before there was a choice
     config = _validated(_overridden(values, overrides), where)
     return _with_whole_paths(config) if overrides else config
@@ -147,9 +175,9 @@ def check_keys(overrides: Sequence[str], command: str, allowed: tuple[str, ...],
 
 
 def differences(stored: Config, wanted: Config) -> list[str]:
-    """Keys whose values differ, with both values; those of SPEED_ONLY may differ."""
+    """Keys whose values differ, with both values; those of NO_EFFECT may differ."""
     a, b = _flat(stored.model_dump()), _flat(wanted.model_dump())
-    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in SPEED_ONLY]
+    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in NO_EFFECT]
 
 
 def _overridden(values: dict[str, JsonValue], overrides: Sequence[str]) -> dict[str, JsonValue]:

@@ -2,16 +2,26 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
 import platform
 import subprocess
 from dataclasses import dataclass
 from datetime import UTC, datetime
-from importlib import metadata
+from importlib import metadata, util
 from pathlib import Path
 
-PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "ray")
-"""Those on which the data of an episode depend."""
+PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "torch", "ray")
+"""Those on which the data of a run depend."""
+
+COMPILED = (
+    "workers.physics.bullet_hooks._overrides",
+    "workers.physics.bullet_hooks._stepper",
+    "workers.physics._observer",
+    "workers.episode._policy",
+    "learner._backward",
+)
+"""The package's own compiled modules, on which they depend as well."""
 
 
 @dataclass(frozen=True)
@@ -46,3 +56,14 @@ def commit() -> str:
 def versions() -> dict[str, str]:
     """Versions of PACKAGES and of Python, by name."""
     return {name: metadata.version(name) for name in PACKAGES} | {"python": platform.python_version()}
+
+
+def compiled() -> dict[str, str]:
+    """SHA-256 of those of COMPILED that are built, by name."""
+    specs = {name: util.find_spec(f"t6gps.{name}") for name in COMPILED}
+    return {name: sha256(Path(spec.origin).read_bytes()) for name, spec in specs.items() if spec and spec.origin}
+
+
+def sha256(content: bytes) -> str:
+    """Its SHA-256 in hexadecimal digits."""
+    return hashlib.sha256(content).hexdigest()

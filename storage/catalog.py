@@ -1,6 +1,8 @@
 """The runs under a root folder, and where each keeps what.
 
 ROOT/NAME/config.json     the configuration, as the run was created with
+ROOT/NAME/origin.json     what made the run: versions, commit, time, digest of the ground
+ROOT/NAME/ground/         the file of its ground, where it has one
 ROOT/NAME/tables/         frames, episodes, iterations, classes: Delta tables
 ROOT/NAME/spool/          episodes of the iteration being sampled
 ROOT/NAME/checkpoints/    states of the learner
@@ -12,19 +14,28 @@ ROOT/NAME/bundles/        episodes that failed, with what is needed to run them 
 from __future__ import annotations
 
 import difflib
+import errno
 import fcntl
+import itertools
 import os
 import re
 import shutil
-from collections.abc import Iterator
+import socket
+import time
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
+from types import MappingProxyType
+from typing import TextIO, cast
 
 from t6gps.storage import durable
 from t6gps.storage.errors import RunError
 
 NAME_LENGTH_N = 64
+GLANCE_S = 0.5
+"""Somebody who only looks whether a run is in use holds its lock for less."""
+NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
 
 
@@ -63,6 +74,10 @@ class Run:
         return self.path / "bundles"
 
     @property
+    def ground(self) -> Path:
+        return self.path / "ground"
+
+    @property
     def config_path(self) -> Path:
         return self.path / "config.json"
 
@@ -77,34 +92,79 @@ def check_name(name: str) -> str:
     return name
 
 
-def create(root: Path, name: str, config_text: str) -> Run:
+def whole(root: Path) -> Path:
+    """A root as every process knows it, wherever it works: absolute, without '~', links or '..'.
+
+    Raises RunError for one that has no such path, or one that the tables could not open.
+    """
+    try:
+        path = root.expanduser().resolve()
+    except RuntimeError as error:
+        raise RunError(f"the root {root} leads nowhere: {error}; give another --root") from None
+    if "%" in str(path):
+        raise RunError(
+            f"the root's path must have no '%', which the Delta tables would decode, found {path}; rename it"
+        )
+    return path
+
+
+def create(
+    root: Path, name: str, config_text: str, files: Mapping[str, bytes] = NO_FILES, numbered: bool = False
+) -> Run:
     """Create the run `name` under `root` (made when missing) with its configuration and empty folders.
 
-    The run appears whole or not at all. Raises RunError when the name is refused or taken, or when the root
-    cannot be written.
+    files      what else it owns, by paths in the run
+    numbered   where the name is taken, the run becomes the first of NAME-2, NAME-3, ... that is free
+
+    The run appears whole or not at all, and of several processes that create one at the same time each gets its own.
+    Raises RunError when the name is refused or taken, or when the root cannot be written.
     """
-    run = Run(root / check_name(name))
-    if run.path.exists():
-        raise RunError(f"{run.path} exists already; choose another name with --run, or add --resume")
-    if "%" in str(root.absolute()):
-        raise RunError(f"the root's path must have no '%', which the Delta tables would decode; found {root}")
-    draft = Run(durable.hidden(run.path))
-    try:
-        root.mkdir(parents=True, exist_ok=True)
-        if not os.access(root, os.W_OK | os.X_OK):
-            raise PermissionError(f"no permission to write in {root}")
-        shutil.rmtree(draft.path, ignore_errors=True)  # of a creation that was cut off
+    root, contents = whole(root), {"config.json": config_text.encode(), ".lock": b"", **files}
+    with _drafted(root, name, "create", numbered) as draft:
         for folder in (draft.tables, draft.spool, draft.checkpoints, draft.figures):
-            folder.mkdir(parents=True)
-        draft.config_path.write_text(config_text, encoding="utf-8")
-        durable.sync(draft.config_path)
-        durable.publish(run.path)
-    except OSError as error:
-        shutil.rmtree(draft.path, ignore_errors=True)
-        raise RunError(
-            f"cannot create run {name!r} under {root}: {error}; the root must be a writable folder"
-        ) from error
-    return run
+            folder.mkdir()
+        for place, content in contents.items():
+            path = draft.path / place
+            path.parent.mkdir(exist_ok=True)
+            path.write_bytes(content)
+        return _claimed(draft, root, name, numbered)
+
+
+def copy(run: Run, root: Path, name: str) -> Run:
+    """Copy a run that nobody uses, whole or not at all. Raises RunError as `create`, and where the run is in use."""
+    root = whole(root)
+    with _unused(run), _drafted(root, name, "copy") as draft:
+        shutil.copytree(run.path, draft.path, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
+        (draft.path / ".lock").touch()
+        return _claimed(draft, root, name)
+
+
+def move(run: Run, root: Path, name: str) -> Run:
+    """Give a run that nobody uses another name or root, in one step. Raises RunError as `copy`.
+
+    Between file systems it is copied, then removed.
+    """
+    root = whole(root)
+    with locked(run):
+        try:
+            root.mkdir(parents=True, exist_ok=True)
+            if durable.claim(run.path, root / check_name(name)):
+                durable.sync(run.path.parent)
+                return Run(root / name)
+        except OSError as error:
+            if error.errno != errno.EXDEV:
+                raise RunError(f"cannot move run {run.name} to {root}: {error}; the root must be writable") from error
+        else:
+            raise _taken(root / name)
+    moved = copy(run, root, name)
+    remove(run)
+    return moved
+
+
+def remove(run: Run) -> None:
+    """Remove a run that nobody uses; nobody ever sees half of it. Raises RunError where it is in use."""
+    with locked(run):
+        durable.discard(run.path)
 
 
 def discard_unused(run: Run) -> None:
@@ -114,10 +174,45 @@ def discard_unused(run: Run) -> None:
         durable.discard(run.path)
 
 
+@contextmanager
+def _drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterator[Run]:
+    """A hidden folder for a run of that name. RunError where the name is taken, or the root cannot be written."""
+    path = root / check_name(name)
+    if not numbered and os.path.lexists(path):
+        raise _taken(path)
+    try:
+        root.mkdir(parents=True, exist_ok=True)
+        if not os.access(root, os.W_OK | os.X_OK):
+            raise PermissionError(f"no permission to write in {root}")
+        with durable.draft(path) as draft:
+            durable.sweep(root)
+            yield Run(draft)
+    except OSError as error:
+        raise RunError(
+            f"cannot {what} run {name!r} under {root}: {error}; the root must be a writable folder with room"
+        ) from error
+
+
+def _claimed(draft: Run, root: Path, name: str, numbered: bool = False) -> Run:
+    """The run that a draft becomes, under its name or the first number that is free. RunError when it is taken."""
+    durable.sync_tree(draft.path)
+    numbers = itertools.count(2) if numbered else ()
+    for free in itertools.chain([name], (f"{name}-{number}" for number in numbers)):
+        path = root / check_name(free)
+        if not os.path.lexists(path) and durable.claim(draft.path, path):
+            return Run(path)
+    raise _taken(root / name)
+
+
+def _taken(path: Path) -> RunError:
+    return RunError(f"{path} exists already; choose another name with --run, or add --resume")
+
+
 def open_run(root: Path, name: str) -> Run:
     """The existing run `name` under `root`. Raises RunError naming the runs that exist, the closest first."""
+    root = whole(root)
     run = Run(root / check_name(name))
-    if run.config_path.is_file():
+    if _is_run(run):
         return run
     names = [other.name for other in list_runs(root)]
     if not names:
@@ -128,39 +223,96 @@ def open_run(root: Path, name: str) -> Run:
 
 
 def list_runs(root: Path) -> list[Run]:
-    """All runs under `root` by name; none when the root does not exist."""
+    """All runs under `root` by name, damaged ones included; none when the root does not exist."""
+    root = whole(root)
     if not root.is_dir():
         return []
-    folders = sorted(path for path in root.iterdir() if _NAME.fullmatch(path.name))
-    return [Run(path) for path in folders if (path / "config.json").is_file()]
+    runs = (Run(path) for path in sorted(root.iterdir()) if _NAME.fullmatch(path.name))
+    return [run for run in runs if _is_run(run)]
+
+
+def _is_run(run: Run) -> bool:
+    """True for a run, whole or with parts that are missing or may not be read."""
+    try:
+        return run.config_path.is_file() or run.tables.is_dir()
+    except PermissionError:
+        return True
 
 
 @contextmanager
 def locked(run: Run) -> Iterator[None]:
     """Hold the run for this process alone; the lock ends with the process, however it ends.
 
-    Raises RunError naming the process that holds it.
+    Raises RunError naming the process that holds it, or why the run cannot be held.
     """
-    with (run.path / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_EX | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            raise RunError(
-                f"run {run.name} is in use by process {file.read() or 'unknown'}; wait for it to end, or stop it"
-            ) from None
+    with _lock_file(run, "a+") as file:
+        deadline = time.monotonic() + GLANCE_S
+        while not _locked(file, fcntl.LOCK_EX):
+            if time.monotonic() > deadline:
+                file.seek(0)
+                raise RunError(
+                    f"run {run.name} is in use by process {file.read().strip() or 'unknown'}; "
+                    "wait for it to end, or stop it"
+                )
+            time.sleep(GLANCE_S / 20)
+        if not _is_of(file, run):
+            raise RunError(f"run {run.name} was moved or removed just now; see t6gps runs")
         file.truncate(0)
-        file.write(str(os.getpid()))
+        file.write(f"{os.getpid()} on {socket.gethostname()}")
         file.flush()
         yield
 
 
+@contextmanager
+def _unused(run: Run) -> Iterator[None]:
+    """Let nobody train the run meanwhile; this writes nothing. Raises RunError where somebody does."""
+    if not (run.path / ".lock").exists():  # nobody has ever used it
+        yield
+        return
+    with _lock_file(run, "r") as file:
+        if not _locked(file, fcntl.LOCK_SH):
+            raise RunError(f"run {run.name} is in use by process {file.read() or 'unknown'}; wait for it to end")
+        yield
+
+
 def process_of(run: Run) -> int | None:
-    """The process that has the run locked, None when there is none."""
-    with (run.path / ".lock").open("a+") as file:
-        try:
-            fcntl.flock(file, fcntl.LOCK_SH | fcntl.LOCK_NB)
-        except BlockingIOError:
-            file.seek(0)
-            return int(file.read() or 0)
-    return None
+    """The process that has the run locked, None when there is none or it has not said so yet; this writes nothing."""
+    if not (run.path / ".lock").exists():  # nobody has ever used it
+        return None
+    with _lock_file(run, "r") as file:
+        if _locked(file, fcntl.LOCK_SH):
+            return None
+        words = file.read().split()
+        return int(words[0]) if words else None
+
+
+def _lock_file(run: Run, mode: str) -> TextIO:
+    path = run.path / ".lock"
+    try:
+        return cast(TextIO, path.open(mode, encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(f"run {run.name} was moved or removed just now; see t6gps runs") from None
+    except OSError as error:
+        need = "to read" if mode == "r" else "to write"
+        raise RunError(f"run {run.name} cannot be held: {path}: {error.strerror}; get permission {need} it") from error
+
+
+def _locked(file: TextIO, kind: int) -> bool:
+    """Lock a file, False where another process has it. RunError for a file system without locks."""
+    try:
+        fcntl.flock(file, kind | fcntl.LOCK_NB)
+    except BlockingIOError:
+        return False
+    except OSError as error:
+        raise RunError(
+            f"{file.name} cannot be locked: {error.strerror}; keep the root on a file system with locks"
+        ) from error
+    return True
+
+
+def _is_of(file: TextIO, run: Run) -> bool:
+    """True when it is still the lock file of the run: another may have been created under its name."""
+    try:
+        return os.path.samestat(os.fstat(file.fileno()), (run.path / ".lock").stat())
+    except FileNotFoundError:
+        return False

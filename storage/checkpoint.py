@@ -59,6 +59,7 @@ def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Map
     durable.publish(path)
     for old in _found(folder)[KEPT_N:]:
         durable.discard(old)
+    durable.sweep(folder)
     return path
 
 

@@ -1,12 +1,26 @@
-"""Files that survive a crash: written under a hidden name, forced to disk, then renamed into place."""
+"""Files that survive a crash: written under a hidden name, forced to disk, then renamed into place.
+
+A file or folder that one process alone writes has one hidden name (`hidden`, `publish`). A folder that several
+processes may make at once is built in a `draft` of its own; one rename gives it its name, or finds the name taken.
+"""
 
 from __future__ import annotations
 
+import errno
+import logging
 import os
+import secrets
 import shutil
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
-_DISCARDED = ".discarded"
+_PARTIAL, _DISCARDED = ".partial", ".discarded"
+_ABANDONED_S = 24 * 3600.0
+"""A draft in which nothing has been made for so long belongs to no process."""
+_TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
+"""How a rename says that its target is there: a folder that holds something, or no folder."""
+_log = logging.getLogger(__name__)
 
 
 def sync(path: Path) -> None:
@@ -18,9 +32,15 @@ def sync(path: Path) -> None:
         os.close(descriptor)
 
 
+def sync_tree(folder: Path) -> None:
+    """Force a folder and everything in it to disk."""
+    for path in (*folder.rglob("*"), folder):
+        sync(path)
+
+
 def hidden(path: Path) -> Path:
     """The sibling of `path` that stands for it while it is not finished; readers ignore it."""
-    return path.with_name(f".{path.name}.partial")
+    return path.with_name(f".{path.name}{_PARTIAL}")
 
 
 def publish(path: Path) -> None:
@@ -35,15 +55,77 @@ def publish(path: Path) -> None:
     sync(path.parent)
 
 
+@contextmanager
+def draft(path: Path) -> Iterator[Path]:
+    """A new hidden folder beside `path`, known to this caller alone; what has not been claimed is removed."""
+    folder = _unique(path, _PARTIAL)
+    folder.mkdir()
+    try:
+        yield folder
+    finally:
+        shutil.rmtree(folder, ignore_errors=True)  # it has its name by now, or is of no use
+
+
+def claim(folder: Path, path: Path) -> bool:
+    """Give a finished folder that is on disk the name `path`; False, and nothing changed, when something has it.
+
+    Of many processes on machines that share the file system, one succeeds: a rename is one step, and replaces neither a
+    file nor a folder that holds something.
+    """
+    try:
+        folder.rename(path)
+    except OSError as error:
+        if folder.exists():
+            if error.errno in _TAKEN:
+                return False
+            raise
+        if not path.is_dir():  # else a file server has repeated what it had done already
+            raise
+    sync(path.parent)
+    return True
+
+
 def sweep(parent: Path) -> None:
-    """Remove what `discard` has left in a folder because it was cut off."""
+    """Remove what was cut off in a folder: discarded folders, and drafts that were abandoned a day ago.
+
+    What cannot be removed is left, and said in the log: it may be another user's.
+    """
     for doomed in parent.glob(f".*{_DISCARDED}"):
-        shutil.rmtree(doomed, ignore_errors=True)
+        _sweep(doomed)
+    for folder in parent.glob(f".*{_PARTIAL}"):
+        try:  # both times are those of the file system, whatever clock this machine has
+            age_s = parent.stat().st_mtime - folder.stat().st_mtime
+        except FileNotFoundError:  # claimed meanwhile
+            continue
+        if age_s > _ABANDONED_S and folder.is_dir():
+            _sweep(folder)
 
 
 def discard(folder: Path) -> None:
     """Remove a folder so that nobody ever sees half of it under its name."""
-    doomed = folder.with_name(f".{folder.name}{_DISCARDED}")
-    shutil.rmtree(doomed, ignore_errors=True)
+    doomed = _unique(folder, _DISCARDED)
     folder.replace(doomed)
-    shutil.rmtree(doomed)
+    _remove(doomed)
+
+
+def _unique(path: Path, ending: str) -> Path:
+    return path.with_name(f".{path.name}.{secrets.token_hex(8)}{ending}")
+
+
+def _sweep(folder: Path) -> None:
+    try:
+        _remove(folder)
+    except OSError as error:
+        _log.info("%s is left over and cannot be removed: %s", folder, error)
+
+
+def _remove(folder: Path) -> None:
+    """Remove a hidden folder, perhaps beside others who sweep it."""
+
+    def judge(_call: object, _path: str, info: tuple[type[BaseException], BaseException, object]) -> None:
+        error = info[1]
+        # Others remove it as well; or a file server keeps what is open in it, and the next sweep takes that.
+        if not (isinstance(error, OSError) and error.errno in (errno.ENOENT, errno.ENOTEMPTY)):
+            raise error
+
+    shutil.rmtree(folder, onerror=judge)

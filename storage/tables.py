@@ -9,12 +9,13 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from pathlib import Path
+from contextlib import contextmanager
 
 import numpy as np
 import pyarrow as pa
 import pyarrow.compute as pc
 from deltalake import DeltaTable, Schema
+from deltalake.exceptions import DeltaError
 from deltalake.transaction import AddAction, CommitProperties, PostCommitHookProperties, Transaction
 
 from t6gps.storage import durable, parquet, schema
@@ -24,6 +25,9 @@ from t6gps.storage.records import Episode
 
 EPISODES_PER_ROW_GROUP_N = 10
 """One episode is read without the rest of its iteration: 10 episodes are about 2.5 MB."""
+
+MESSAGE_LENGTH_N = 300
+"""Characters of a library's message that are repeated; it may add where in its own code it stopped."""
 
 _APPLICATION = "t6gps"
 """Application id of the Delta transactions; their version is the iteration."""
@@ -80,15 +84,24 @@ def _row_groups(episodes: Iterable[Episode], iteration: int, summaries: list[pa.
 
 
 def committed_iterations(run: Run) -> int:
-    """How many iterations are committed: 0 .. n - 1."""
-    location = str(run.tables / "episodes")
-    return _committed(DeltaTable(location)) if DeltaTable.is_deltatable(location) else 0
+    """How many iterations are committed: 0 .. n - 1. DataError where the table that says so is damaged or missing."""
+    episodes = _delta(run, "episodes")
+    if episodes is not None:
+        return _committed(episodes)
+    for name in schema.TABLES:
+        other = _delta(run, name)
+        if other is not None and _committed(other) > 1:
+            raise _damaged(run, "episodes", f"it is missing, and {name} has {_committed(other)} iterations")
+    return 0
 
 
 def files(run: Run) -> tuple[int, dict[str, list[str]]]:
-    """How many iterations are committed, and every table's Parquet files, which may hold one more."""
+    """How many iterations are committed, and every table's Parquet files, which may hold more.
+
+    DataError where a table or a file is missing or damaged.
+    """
     iterations_n = committed_iterations(run)
-    return iterations_n, {name: _files(run.tables / name) if iterations_n else [] for name in schema.TABLES}
+    return iterations_n, {name: _files(run, name, iterations_n) for name in schema.TABLES}
 
 
 def read(run: Run, table: str, columns: list[str] | None = None, filter: pc.Expression | None = None) -> pa.Table:
@@ -97,7 +110,7 @@ def read(run: Run, table: str, columns: list[str] | None = None, filter: pc.Expr
     columns   their names, in the wanted order; all when None
     filter    rows to keep, such as pyarrow.compute.field("iteration") == 3; all when None
 
-    Raises DataError for an unknown table or column.
+    Raises DataError for an unknown table or column, and where the table is damaged.
     """
     if table not in schema.TABLES:
         raise DataError(f"there is no table {table!r}; tables: {', '.join(schema.TABLES)}")
@@ -108,8 +121,9 @@ def read(run: Run, table: str, columns: list[str] | None = None, filter: pc.Expr
         raise DataError(f"table {table} has no column {unknown[0]!r}; columns: {', '.join(whole.names)}")
     wanted = pa.schema([whole.field(name) for name in names], whole.metadata)
     iterations_n = committed_iterations(run)
-    paths = _files(run.tables / table) if iterations_n else []
-    return parquet.rows(table, paths, iterations_n).to_table(names, filter=filter).cast(wanted)
+    paths = _files(run, table, iterations_n)
+    with _readable(run, table):
+        return parquet.rows(table, paths, iterations_n).to_table(names, filter=filter).cast(wanted)
 
 
 def episode_frames(run: Run, episode_id: int) -> pa.Table:
@@ -140,9 +154,50 @@ def frames_of(run: Run, iteration: int, columns: Sequence[str]) -> dict[int, pa.
     }
 
 
-def _files(folder: Path) -> list[str]:
-    actions = pa.table(DeltaTable(str(folder)).get_add_actions(flatten=True))
-    return [str(folder / name) for name in sorted(actions.column("path").to_pylist())]
+def _files(run: Run, table: str, iterations_n: int) -> list[str]:
+    """The files of a table of `iterations_n` or more iterations, one each. DataError where one is not whole."""
+    if not iterations_n:
+        return []
+    delta = _delta(run, table)
+    if delta is None:
+        raise _damaged(run, table, "it is missing")
+    with _readable(run, table):
+        actions = pa.table(delta.get_add_actions(flatten=True)).select(["path", "size_bytes"]).sort_by("path")
+        sizes = {run.tables / table / row["path"]: row["size_bytes"] for row in actions.to_pylist()}
+        for file, size in sizes.items():
+            if not file.is_file() or file.stat().st_size != size:
+                found = f"{file.stat().st_size}" if file.is_file() else "none"
+                raise _damaged(run, table, f"{file.name} has {size} bytes, found {found}")
+    committed_n = _committed(delta)
+    if len(sizes) < max(iterations_n, committed_n):
+        raise _damaged(run, table, f"its log has {len(sizes)} of {max(iterations_n, committed_n)} iterations")
+    if committed_n > iterations_n + 1 and committed_iterations(run) == iterations_n:
+        raise _damaged(run, "episodes", f"its log has {iterations_n} of {committed_n - 1} iterations or more")
+    return [str(file) for file in sizes]
+
+
+def _delta(run: Run, table: str) -> DeltaTable | None:
+    """A table by its log, None before the first commit. DataError where the log is damaged."""
+    location = str(run.tables / table)
+    with _readable(run, table):
+        return DeltaTable(location) if DeltaTable.is_deltatable(location) else None
+
+
+@contextmanager
+def _readable(run: Run, table: str) -> Iterator[None]:
+    """What libraries say of a table that they cannot read becomes a DataError."""
+    try:
+        yield
+    except (DeltaError, pa.ArrowException, OSError) as error:
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise _damaged(run, table, lines[0][:MESSAGE_LENGTH_N]) from error
+
+
+def _damaged(run: Run, table: str, what: str) -> DataError:
+    return DataError(
+        f"run {run.name} is not whole: table {table} in {run.tables / table} cannot be read: {what}; "
+        "restore the run from a copy"
+    )
 
 
 def _joined(table: str, parts: list[pa.Table]) -> pa.Table:
@@ -173,7 +228,7 @@ def _commit(run: Run, table: str, iteration: int, groups: Iterable[pa.Table]) ->
     folder = run.tables / table
     definition = Schema.from_arrow(schema.TABLES[table])
     file = folder / f"iteration-{iteration:06d}.parquet"
-    delta = DeltaTable(str(folder)) if DeltaTable.is_deltatable(str(folder)) else None
+    delta = _delta(run, table)
     if delta and iteration < _committed(delta):
         if table == "frames" and not parquet.holds(file, groups):
             raise DataError(

@@ -64,6 +64,6 @@ def load(run: Folder, version: int | None) -> Policy:
             versions = ", ".join(map(str, sorted(kept))) or "none yet"
             raise RunError(f"run {run.name} keeps no policy of version {version!r}; kept: {versions}")
         latest = checkpoint.load(kept[version])
-    learner = new_learner(configuration.parse(run.config_path.read_text()))
+    learner = new_learner(configuration.kept(run))
     learner.restore(cast(Manifest, latest[1]), latest[2])
     return Policy(learner.policy())

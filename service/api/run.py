@@ -40,7 +40,7 @@ class Run:
     @property
     def config(self) -> Config:
         """The configuration that it was created with."""
-        return configuration.parse(self._folder.config_path.read_text())
+        return configuration.kept(self._folder)
 
     @property
     def evaluation(self) -> Evaluation | None:
@@ -85,7 +85,7 @@ class Run:
 
     @property
     def _folder(self) -> catalog.Run:
-        return catalog.Run(self.path)
+        return catalog.Run(catalog.whole(self.path))
 
 
 def open_run(path: str | PathLike[str]) -> Run:

@@ -8,6 +8,7 @@ stops everything that was started, keeps everything that was sampled, and comes 
 from __future__ import annotations
 
 import json
+import logging
 from collections.abc import Callable, Mapping, Sequence
 from contextlib import closing
 from dataclasses import dataclass
@@ -24,6 +25,7 @@ from t6gps.storage.errors import ConfigError
 Row = Mapping[str, int | float | None]
 Setting = str | int | float | bool | Sequence[str | int | float]
 FINISHED = "finished"
+_log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
@@ -87,7 +89,7 @@ def train(
     """
     source, folder = fspath(source), Path(root)
     config = configuration.load(source, _overrides(settings, workers))
-    run = session.begin(config, folder, name, Path(source).stem, resume)
+    run = session.begin(config, folder, name, Path(source).stem, resume, _log.warning)
     session.complete(config, run, serial, _Teller(progress))
     return Run(run.path)
 
@@ -117,7 +119,7 @@ def evaluate(
         if not isinstance(value, int) or value < least:
             raise ConfigError(f"evaluate takes a whole {what} >= {least}, found {value!r}; give another number")
     folder = catalog.Run(run.path)
-    config = session.evaluation_config(folder, _overrides(settings, workers))
+    config = session.evaluation_config(folder, _overrides(settings, workers), _log.warning)
     with closing(session.restored(config, folder, serial)) as executor:
         return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, _Teller(progress))
 

@@ -32,7 +32,7 @@ from t6gps.service.cli.options import (
 )
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
-from t6gps.service.training import evaluation, session
+from t6gps.service.training import evaluation, origin, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
@@ -73,7 +73,7 @@ def train(
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
-    run = session.begin(config, root, run_name, Path(source).stem, resume)
+    run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
     try:
         with terminal.ProgressDisplay(config.run.iterations) as display:
             result = session.complete(config, run, serial, display)
@@ -81,7 +81,7 @@ def train(
         _exit_interrupted(_train_command(run, source, root, overrides))
     from t6gps.service.views import run_figures
 
-    pictures = run_figures.draw(run, config)
+    pictures = run_figures.draw(run, origin.configured(run))
     stored.print_learning(run)
     terminal.print_evaluation(result)
     live.name_quarantined(run)
@@ -134,7 +134,7 @@ def evaluate(
 ) -> None:
     """Evaluate a run's newest policy without noise on unseen seeds."""
     run = catalog.open_run(root, run_name)
-    config = session.evaluation_config(run, with_workers(overrides, workers))
+    config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
     with (
         closing(session.restored(config, run, serial, engine)) as executor,
         terminal.ProgressDisplay(config.run.iterations) as display,

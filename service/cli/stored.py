@@ -13,14 +13,16 @@ import typer
 
 from t6gps.service import config as configuration
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName
-from t6gps.service.training import evaluation
+from t6gps.service.training import evaluation, origin, session
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.errors import ConfigError, RunError, T6GpsError
 from t6gps.storage.sql import query as sql_query
 
+SUMMARY = ("run", "iterations", "cost", "forward_speed_m_per_s")
+"""What the list of runs says of each."""
 EXPORT_SECTIONS = ("robot.", "terrain.")
 
 
@@ -47,30 +49,36 @@ def add_to(app: typer.Typer) -> None:
 
 def runs(root: Root = DEFAULT_ROOT) -> None:
     """List the runs."""
-    if not root.is_dir():
+    if not catalog.whole(root).is_dir():
         raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
-    rows = []
+    rows: list[dict[str, object]] = []
+    faults = []
     for run in catalog.list_runs(root):
-        last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
-        done = len(last) and last[0]["iteration"] + 1
-        planned = configuration.parse(run.config_path.read_text()).run.iterations
-        rows.append(
-            {
-                "run": run.name,
-                "iterations": f"{done} of {planned}",
-                "cost": last[0]["cost"] if last else None,
-                "forward_speed_m_per_s": last[0]["forward_speed_m_per_s"] if last else None,
-            }
-        )
+        try:
+            rows.append(_summary(run))
+        except T6GpsError as error:  # one damaged run hides none of the others
+            rows.append(dict.fromkeys(SUMMARY) | {"run": run.name, "iterations": "damaged"})
+            faults.append(str(error))
     columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
-    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
+    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in SUMMARY[2:]}
     terminal.print_rows(f"Runs in {root}", rows, columns)
+    for fault in faults:
+        typer.echo(f"damaged: {fault}")
+
+
+def _summary(run: Run) -> dict[str, object]:
+    """A run in a line. An error where something of it cannot be read."""
+    planned, done = origin.configured(run).run.iterations, tables.files(run)[0]
+    last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
+    known = {key: last[0][key] for key in SUMMARY[2:]} if last else dict.fromkeys(SUMMARY[2:])
+    return {"run": run.name, "iterations": f"{done} of {planned}", **known}
 
 
 def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
     """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
     run = catalog.open_run(root, run_name)
-    if not tables.committed_iterations(run):
+    origin.configured(run)  # an error for a run that is not whole
+    if not tables.files(run)[0]:
         typer.echo(f"run {run_name} has not finished an iteration yet")
         return
     print_learning(run)
@@ -107,15 +115,17 @@ def render(
     """Draw a stored episode from its recorded states: a still, a strip of snapshots, or a film."""
     from t6gps.workers.ground.ground import ground
     from t6gps.workers.pictures import render as rendering
+    from t6gps.workers.pictures.scene import Sizes
 
     run = catalog.open_run(root, run_name)
     frames = tables.episode_frames(run, episode)
     row = tables.read(run, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
-    config = configuration.parse(run.config_path.read_text())
+    session.tell_changes(run, terminal.warn)
+    config = origin.configured(run)
     terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
-    radius_m = config.task.waypoint_radius_m
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
     with terminal.task("rendering") as progress:
-        rendering.render(frames, terrain, out, step=step, strip=strip, progress=progress, waypoint_radius_m=radius_m)
+        rendering.render(frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)
 
 

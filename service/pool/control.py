@@ -163,11 +163,13 @@ def status(run: Run) -> Status:
     """
     path = run.pool / "status.json"
     try:
-        newest: Status = json.loads(path.read_text())
+        newest: Status = json.loads(path.read_text(encoding="utf-8"))
     except FileNotFoundError:
         raise RunError(
             f"run {run.name} has no status: it was never run with workers; start it with t6gps train"
         ) from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"cannot read {path}: {error}; resume the run, which writes it anew") from None
     if newest["state"] in ENDED:
         return newest
     if catalog.process_of(run) != newest["pid"]:

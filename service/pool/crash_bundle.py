@@ -77,7 +77,7 @@ def read(path: Path) -> Bundle:
         policy = record["policy"]
         return Bundle(
             EpisodePlan(**record["plan"]),
-            RolloutSettings.model_validate_json(json.dumps(record["settings"])),
+            _on_own_ground(RolloutSettings.model_validate_json(json.dumps(record["settings"])), path),
             PolicySnapshot(policy["version"], layers, policy["offset_m"], policy["scale_m"]),
             record["failures"],
             record["versions"],
@@ -86,6 +86,15 @@ def read(path: Path) -> Bundle:
         raise RunError(
             f"{path} is not a crash bundle: {error}; give RUN/bundles/episode-N.json with the .npz beside it"
         ) from None
+
+
+def _on_own_ground(settings: RolloutSettings, bundle: Path) -> RolloutSettings:
+    """The settings with the ground that the bundle's run keeps, wherever the run has been moved to."""
+    file = settings.terrain.file
+    copy = bundle.absolute().parents[1] / "ground" / Path(file or "").name
+    if file is None or not copy.is_file():
+        return settings
+    return settings.model_copy(update={"terrain": settings.terrain.model_copy(update={"file": str(copy)})})
 
 
 def kept(folder: Path, purpose: str) -> set[int]:

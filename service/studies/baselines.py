@@ -13,13 +13,12 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.seeding import Branch
 from t6gps.service.studies.declared import Baseline
 from t6gps.service.studies.watcher import Progress, Watcher
-from t6gps.service.training import evaluation, session
+from t6gps.service.training import evaluation, origin, session
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint, durable
@@ -48,6 +47,7 @@ PPO_DISCOUNT = 0.95
 
 def complete(baseline: Baseline, config: Config, run: Run, watcher: Watcher) -> None:
     """Train a baseline with the steps that `config` allows, keep what it learned, and keep its evaluation."""
+    config = origin.at_work(config, run)
     steps = config.run.iterations * config.run.episodes * config.run.steps
     with catalog.locked(run), watcher.task(f"training {baseline.value}") as progress:
         if baseline is Baseline.PERIODIC:
@@ -63,7 +63,7 @@ def evaluate(baseline: Baseline, run: Run, overrides: Sequence[str], serial: boo
     """The evaluation of a finished baseline on the episodes that any policy of this run would get."""
     if baseline is Baseline.PPO:
         return session.evaluate_newest(run, overrides, serial, observer)
-    config = configuration.parse(run.config_path.read_text(), overrides)
+    config = origin.configured(run, overrides)
     nominal_m = nominal_rest_length(config.robot)
     control = gaits.flop(nominal_m) if baseline is Baseline.FLOP else gaits.waves(nominal_m, _kept_gait(run))
     size = config.run

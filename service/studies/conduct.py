@@ -20,6 +20,7 @@ from t6gps.service.studies.declared import PAPER, PAPER_SEEDS, Arm, Baseline, Sc
 from t6gps.service.studies.origin import Origin, origin, recorded
 from t6gps.service.studies.watcher import Watcher
 from t6gps.service.training import evaluation, session
+from t6gps.service.training import origin as run_origin
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.views import run_figures
 from t6gps.storage import catalog
@@ -141,7 +142,7 @@ def conduct(
     for number, trial in enumerate(missing, len(planned) - len(missing) + 1):
         progress = f"run {number} of {len(planned)}: arm {trial.arm}, seed {trial.seed}"
         watcher.say(f"{progress}; {minutes(pace.left_s())} left")
-        run = runs.get(trial.name) or catalog.create(root, trial.name, trial.config.to_json())
+        run = runs.get(trial.name) or run_origin.create(trial.config, root, trial.name)
         with recorded(run, study, trial.arm, trial.seed, present):
             _complete(trial, run, serial, watcher)
         pace.done(estimate_s([trial], 0))
@@ -173,7 +174,7 @@ def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
         return
     with watcher.run(trial.config.run.iterations) as observer:
         session.complete(trial.config, run, serial, observer)
-    run_figures.draw(run, trial.config)
+    run_figures.draw(run, run_origin.configured(run))
 
 
 def _evaluated(trial: Trial, run: Run, overrides: Sequence[str], serial: bool, watcher: Watcher) -> Evaluation:

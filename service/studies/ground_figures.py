@@ -37,6 +37,7 @@ from t6gps.storage.sql.query import query
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures import render
+from t6gps.workers.pictures.scene import Sizes
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.topology import BAR_LENGTH_M, DELTA, FACES, LAMBDA
 
@@ -161,8 +162,9 @@ def climb(finished: Sequence[Finished]) -> Figure:
     """Snapshots of the largest climb by the project's own renderer, and the height along it (paper Sec. V-C)."""
     climb_ = largest_climb(finished)
     steps = np.linspace(climb_.bottom, climb_.top, SNAPSHOTS_N).round().astype(int).tolist()
-    radius_m = climb_.outcome.trial.config.task.waypoint_radius_m
-    picture = render.snapshots(climb_.frames, climb_.terrain, steps, radius_m)
+    config = climb_.outcome.trial.config
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+    picture = render.snapshots(climb_.frames, climb_.terrain, steps, sizes)
     with rc_context(STYLE):
         figure = canvas(11, 7.6)
         above, below = figure.subplots(2, 1, height_ratios=[2.6, 1])

@@ -1,4 +1,4 @@
-"""Where a study's run comes from, in a file beside its tables: study, arm and seed, commits, and the time they took."""
+"""A study's run: study, arm and seed, commits that worked on it, and the time they took, in a file of the run."""
 
 from __future__ import annotations
 
@@ -12,7 +12,9 @@ from dataclasses import asdict, dataclass
 from t6gps.storage import durable
 from t6gps.storage.catalog import Run
 
-FILE = "origin.json"
+FILE = "study.json"
+EARLIER_FILE = "origin.json"
+"""Where versions up to 0.2.0 kept it; `training.origin` has another record there."""
 
 
 @dataclass(frozen=True)
@@ -32,11 +34,11 @@ class Origin:
 
 def origin(run: Run) -> Origin:
     """The origin of a run, as its file has it."""
-    path = run.path / FILE
-    if not path.exists():
-        return Origin()
-    record = json.loads(path.read_text())
-    return Origin(**record | {"commits": tuple(record["commits"])})
+    for path in (run.path / FILE, run.path / EARLIER_FILE):
+        record = json.loads(path.read_bytes()) if path.exists() else {}
+        if "study" in record:
+            return Origin(**record | {"commits": tuple(record["commits"])})
+    return Origin()
 
 
 @contextmanager

@@ -113,9 +113,20 @@ def keep(run: Run, evaluation: Evaluation, condition: str | None = None) -> None
 
 
 def kept(run: Run, condition: str | None = None) -> Evaluation | None:
-    """The evaluation that ended the training, or one under another condition; None before it is kept."""
+    """The evaluation that ended the training, or one under another condition; None before it is kept.
+
+    RunError where its file is damaged.
+    """
     path = _path(run, condition)
-    return Evaluation.from_json(path.read_text()) if path.exists() else None
+    if not path.exists():
+        return None
+    try:
+        return Evaluation.from_json(path.read_text(encoding="utf-8"))
+    except (OSError, ValueError, KeyError, TypeError) as error:
+        raise RunError(
+            f"run {run.name} is not whole: {path} cannot be read: {error!r}; restore it from a copy, or remove it and "
+            "resume the run"
+        ) from None
 
 
 def _path(run: Run, condition: str | None) -> Path:

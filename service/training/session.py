@@ -14,7 +14,7 @@ from t6gps.service import config as configuration
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
 from t6gps.service.pool.state import RunState
-from t6gps.service.training import evaluation, loop
+from t6gps.service.training import evaluation, loop, origin
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint
@@ -25,6 +25,9 @@ if TYPE_CHECKING:
     from t6gps.workers.physics import engine as physics
     from t6gps.workers.settings import RobotSettings
 
+
+Warn = Callable[[str], object]
+"""Takes a sentence for whoever should know."""
 
 EVALUATION_SECTIONS = ("robot.", "task.", "terrain.", "randomisation.", "run.steps", "run.workers")
 
@@ -69,32 +72,31 @@ def _simulation(engine: Engine) -> Callable[[RobotSettings], physics.Engine]:
 
 def check_unchanged(run: Run, config: Config, remedy: str) -> None:
     """RunError with all differences if the run was created with another configuration (workers aside)."""
-    stored = configuration.parse(run.config_path.read_text())
-    changed = configuration.differences(stored, config)
+    changed = origin.differences(run, config)
     if changed:
         raise RunError(f"run {run.name} has another configuration: {'; '.join(changed)}; {remedy}")
 
 
-def begin(config: Config, root: Path, name: str | None, default: str, resume: bool) -> Run:
+def begin(config: Config, root: Path, name: str | None, default: str, resume: bool, warn: Warn) -> Run:
     """The run of that name below `root`: a new one, or the one that there is, to `resume` it.
 
-    Without a name it is `default`, or the first of default-2, default-3, ... that no run has. RunError when the name is
-    taken or refused, when there is nothing to resume, or when it has another configuration.
+    Without a name it is `default`, or the first of default-2, default-3, ... that is free. RunError when the name is
+    taken or refused, when there is nothing to resume, or when it has another configuration. `warn` is told what made
+    the run and is another now.
     """
-    if resume:
-        run = catalog.open_run(root, default if name is None else name)
-        check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
-        return run
-    return catalog.create(root, _free_name(root, default) if name is None else name, config.to_json())
+    if not resume:
+        return origin.create(config, root, default if name is None else name, numbered=name is None)
+    run = catalog.open_run(root, default if name is None else name)
+    tell_changes(run, warn)
+    check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
+    return run
 
 
-def _free_name(root: Path, name: str) -> str:
-    taken = {run.name for run in catalog.list_runs(root)}
-    number = 2
-    free = name
-    while free in taken:
-        free, number = f"{name}-{number}", number + 1
-    return free
+def tell_changes(run: Run, warn: Warn) -> None:
+    """Tell what made a run and is another now. RunError for a run of a later version."""
+    sentence = origin.changes(run)
+    if sentence is not None:
+        warn(sentence)
 
 
 def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
@@ -103,6 +105,7 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
     Everything sampled is kept when KeyboardInterrupt comes. A run is removed whose first executor cannot start.
     """
     with catalog.locked(run):
+        config = origin.at_work(config, run)
         try:
             started = start_executor(config, serial, run)
         except (RunError, PhysicsError, TerrainError):
@@ -119,16 +122,20 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
 
 def evaluate_newest(run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:
     """Evaluate a run's newest policy in the world that `overrides` change, on the seeds of the run's own evaluation."""
-    config = configuration.parse(run.config_path.read_text(), overrides)
+    config = origin.configured(run, overrides)
     with closing(restored(config, run, serial)) as executor:
         size = config.run
         return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
 
 
-def evaluation_config(run: Run, overrides: Sequence[str]) -> Config:
-    """A run's configuration in the world that `overrides` change. ConfigError for one that would change the policy."""
+def evaluation_config(run: Run, overrides: Sequence[str], warn: Warn) -> Config:
+    """A run's configuration in the world that `overrides` change. ConfigError for one that would change the policy.
+
+    `warn` is told what made the run and is another now.
+    """
     configuration.check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
-    return configuration.parse(run.config_path.read_text(), overrides)
+    tell_changes(run, warn)
+    return origin.configured(run, overrides)
 
 
 def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:

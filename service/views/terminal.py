@@ -86,6 +86,11 @@ def say(sentence: str, style: str | None = None) -> None:
     console.print(sentence, style=style, highlight=False, soft_wrap=True, markup=False)
 
 
+def warn(sentence: str) -> None:
+    """Print a warning."""
+    say(f"warning: {sentence}", style="yellow")
+
+
 class ProgressDisplay:
     """Shows a bar per phase of the current iteration and one line per finished iteration."""
 
@@ -147,7 +152,7 @@ class StudyDisplay:
 
     def warn(self, sentence: str) -> None:
         """Print a warning."""
-        say(f"warning: {sentence}", style="yellow")
+        warn(sentence)
 
     def run(self, iterations: int) -> ProgressDisplay:
         """The bars of a run that is trained or evaluated."""

@@ -1,5 +1,6 @@
 """Laws of the configuration: presets load, overrides reach their key, and everything else is refused by name."""
 
+import codecs
 import json
 from pathlib import Path
 from typing import get_args
@@ -9,7 +10,8 @@ from pydantic import BaseModel
 
 from t6gps.learner.settings import ActionValueSettings
 from t6gps.service import config as configuration
-from t6gps.service.config import Config, differences, load, parse, presets
+from t6gps.service.config import Config, differences, kept, load, parse, presets
+from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
 
 
@@ -114,6 +116,36 @@ def test_a_file_is_read_and_a_broken_one_refused(tmp_path: Path) -> None:
         load(str(tmp_path / "missing.toml"))
 
 
+@pytest.mark.parametrize("bom", [b"", codecs.BOM_UTF8])
+def test_a_byte_order_mark_says_nothing(bom: bytes, tmp_path: Path) -> None:
+    file, run = tmp_path / "mine.toml", catalog.create(tmp_path, "one", "{}")
+    file.write_bytes(bom + b"[run]\nepisodes = 7\n")
+    run.config_path.write_bytes(bom + load(str(file)).to_json().encode())
+    assert kept(run) == load(str(file))
+    assert kept(run).run.episodes == 7
+
+
+@pytest.mark.parametrize("encoding", ["utf-16", "utf-16-le", "latin-1"])
+def test_another_encoding_is_refused_by_name(encoding: str, tmp_path: Path) -> None:
+    file, run = tmp_path / "mine.toml", catalog.create(tmp_path, "one", "{}")
+    for path in (file, run.config_path):
+        path.write_bytes("# é\n[run]\nepisodes = 7\n".encode(encoding))
+    for read in (lambda: load(str(file)), lambda: kept(run)):
+        with pytest.raises(ConfigError, match=r"(mine.toml|config.json) is not text in UTF-8: .* save it as UTF-8"):
+            read()
+
+
+@pytest.mark.parametrize("text", ["", "[]", "3", "null", '{"run": 3}', '{"run": {"seed": "x"}}', None])
+def test_a_run_whose_configuration_is_damaged_is_one_clear_error(text: str | None, tmp_path: Path) -> None:
+    run = catalog.create(tmp_path, "one", "{}")
+    if text is None:
+        run.config_path.unlink()
+    else:
+        run.config_path.write_text(text)
+    with pytest.raises(ConfigError, match=r"one/config\.json"):
+        kept(run)
+
+
 def test_every_setting_says_what_it_is() -> None:
     sections: list[type[BaseModel]] = [Config]
     for section in sections:
@@ -130,9 +162,9 @@ def test_a_configuration_from_before_the_action_value_had_settings_means_their_d
     assert differences(configuration.parse(json.dumps(values)), Config()) == []
 
 
-def test_differences_name_the_key_and_both_values_and_ignore_the_number_of_workers() -> None:
+def test_differences_name_the_key_and_both_values_and_ignore_what_data_do_not_depend_on() -> None:
     a = load("flat-quick")
-    b = load("flat-quick", ["run.workers=7", "learner.kl_weight=0.5"])
+    b = load("flat-quick", ["run.workers=7", 'terrain.accept=["step"]', "learner.kl_weight=0.5"])
     assert differences(a, b) == [f"learner.kl_weight = 0.5 (the run has {a.learner.kl_weight})"]
     assert configuration.differences(a, a) == []
 

@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import os
 import shutil
+from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
@@ -16,6 +18,7 @@ from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
+from t6gps.storage.sql.query import query
 
 ORDER = ["frames", "classes", "iterations", "episodes"]
 """In which tables are committed: an iteration is there when it stands in the last one."""
@@ -247,3 +250,29 @@ def test_a_root_with_blanks_and_accents_works_also_when_relative(
     commit(run, 0)
     assert tables.read(run, "episodes").num_rows == 3
     assert tables.episode_frames(run, 1).num_rows == 6
+
+
+DAMAGES: dict[str, Callable[[Path], object]] = {
+    "gap in the log": lambda table: (table / "_delta_log" / f"{1:020d}.json").unlink(),
+    "commit without content": lambda table: (table / "_delta_log" / f"{2:020d}.json").write_text(""),
+    "commit that is no JSON": lambda table: (table / "_delta_log" / f"{2:020d}.json").write_text("no"),
+    "commits that are gone": lambda table: [
+        (table / "_delta_log" / f"{number:020d}.json").unlink() for number in (2, 3)
+    ],
+    "no table": shutil.rmtree,
+    "no file": lambda table: (table / "iteration-000001.parquet").unlink(),
+    "half a file": lambda table: os.truncate(table / "iteration-000001.parquet", 100),
+}
+
+
+@pytest.mark.parametrize("damage", DAMAGES)
+@pytest.mark.parametrize("table", schema.TABLES)
+def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: str) -> None:
+    for iteration in range(3):
+        commit(run, iteration)
+    DAMAGES[damage](run.tables / table)
+    with pytest.raises(DataError, match=f"run trial is not whole: table {table} in .*restore") as refused:
+        tables.files(run)
+    assert "\n" not in str(refused.value)
+    with pytest.raises(DataError, match="run trial is not whole"):
+        query(run, "SELECT count(*) FROM frames")

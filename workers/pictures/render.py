@@ -34,9 +34,8 @@ from t6gps.workers.pictures.raycast import (
     cast_shadow,
     look_up,
 )
-from t6gps.workers.pictures.scene import CABLE, POLE, TRACK, Rods, Scene
+from t6gps.workers.pictures.scene import CABLE, POLE, TRACK, USUAL, Rods, Scene, Sizes
 from t6gps.workers.robot.topology import FACES
-from t6gps.workers.settings import HALF_DIAMETER_M
 
 Array = NDArray[np.float64]
 Floats = NDArray[np.float32]
@@ -102,22 +101,20 @@ def still(
     terrain: Terrain | None,
     step: int,
     size: tuple[int, int] = STILL_SIZE,
-    waypoint_radius_m: float = HALF_DIAMETER_M,
+    sizes: Sizes = USUAL,
 ) -> Picture:
     """Picture [h, w, 3] of row `step` of an episode's frames on its ground (None: flat).
 
     ConfigError if the episode has no such row.
     """
     _check_steps(frames, [step])
-    return _draw(scenes.build(frames, terrain, [step], waypoint_radius_m), step, size, STILL_SAMPLES)
+    return _draw(scenes.build(frames, terrain, [step], sizes), step, size, STILL_SAMPLES)
 
 
-def snapshots(
-    frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], waypoint_radius_m: float = HALF_DIAMETER_M
-) -> Picture:
+def snapshots(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], sizes: Sizes = USUAL) -> Picture:
     """Pictures of several rows in one, from left to right and from top to bottom. ConfigError as for `still`."""
     _check_steps(frames, steps)
-    scene = scenes.build(frames, terrain, steps, waypoint_radius_m)
+    scene = scenes.build(frames, terrain, steps, sizes)
     columns = min(len(steps), STRIP_COLUMNS)
     width, height = PANEL_SIZE[0] + STRIP_GAP, PANEL_SIZE[1] + STRIP_GAP
     sheet = np.full((-(-len(steps) // columns) * height - STRIP_GAP, columns * width - STRIP_GAP, 3), 255, np.uint8)
@@ -132,11 +129,11 @@ def film(
     terrain: Terrain | None,
     path: Path,
     progress: Progress | None = None,
-    waypoint_radius_m: float = HALF_DIAMETER_M,
+    sizes: Sizes = USUAL,
 ) -> None:
     """Write all rows as an mp4 film in real time, ten pictures a second; `progress(done, total)` follows them."""
     steps = range(frames.num_rows)
-    scene = scenes.build(frames, terrain, steps, waypoint_radius_m)
+    scene = scenes.build(frames, terrain, steps, sizes)
     writer = imageio_ffmpeg.write_frames(
         str(path),
         FILM_SIZE,
@@ -166,17 +163,17 @@ def render(
     frames: pa.Table,
     terrain: Terrain | None,
     out: Path,
+    sizes: Sizes = USUAL,
     *,
     step: int | None = None,
     strip: int | None = None,
     progress: Progress | None = None,
-    waypoint_radius_m: float = HALF_DIAMETER_M,
 ) -> None:
     """Write a film (`out` ends in .mp4) or a picture (.png) of an episode's frames on its ground (None: flat).
 
-    A picture shows row `step`, the middle one by default, or `strip` rows spread evenly over the episode. The
-    file appears whole or not at all. ConfigError for another suffix, a missing folder, a row that the episode does
-    not have, or options that do not go together.
+    A picture shows row `step`, the middle one by default, or `strip` rows spread evenly over the episode. The file
+    appears whole or not at all. ConfigError for another suffix, a missing folder, a row that the episode does not have,
+    or options that do not go together.
     """
     rows = frames.num_rows
     if out.suffix not in (".png", ".mp4"):
@@ -190,14 +187,14 @@ def render(
     draft = durable.hidden(out)
     try:
         if out.suffix == ".mp4":
-            film(frames, terrain, draft, progress, waypoint_radius_m)
+            film(frames, terrain, draft, progress, sizes)
         else:
             if strip is None:
                 chosen = rows // 2 if step is None else step
-                picture = still(frames, terrain, chosen, waypoint_radius_m=waypoint_radius_m)
+                picture = still(frames, terrain, chosen, sizes=sizes)
             else:
-                steps = np.linspace(0, rows - 1, strip).round().astype(int).tolist()
-                picture = snapshots(frames, terrain, steps, waypoint_radius_m)
+                spread = np.linspace(0, rows - 1, strip).round().astype(int).tolist()
+                picture = snapshots(frames, terrain, spread, sizes)
             Image.fromarray(picture).save(draft, format="png")
         durable.publish(out)
     except OSError as error:
@@ -285,7 +282,7 @@ def _paint(scene: Scene, step: int, x: Floats, y: Floats, pixel: Floats, albedo:
     middle = corners.mean(axis=0)
     reach = float(np.hypot(*(corners - middle).T).max())
     for centre, radius, triangle, colour, fill in (
-        (scene.waypoint[step], scene.waypoint_radius_m, None, WAYPOINT_COLOUR, 0.3),
+        (scene.waypoint[step], scene.sizes.waypoint_radius_m, None, WAYPOINT_COLOUR, 0.3),
         (middle, reach, corners - middle, TRIANGLE_COLOURS[scene.kind[step]], 0.55),
     ):
         across, along = x - float(centre[0]), y - float(centre[1])

@@ -50,9 +50,6 @@ FLAG_HEIGHT_M = 1.0
 BAR, CAP, CABLE, POLE, TRACK = range(5)
 """Parts, in the order of render.ROD_COLOURS."""
 
-BAR_RADIUS_M = RobotSettings().bar_radius_m
-"""The usual one: recorded rows do not tell the robot's own."""
-
 CAP_LENGTH_M = 0.07
 """Of the coloured ends of a bar."""
 
@@ -67,6 +64,17 @@ BALL_RADIUS_M = 0.10
 
 TRACK_RADIUS_M = 0.02
 """Of the track of the centre of mass."""
+
+
+@dataclass(frozen=True)
+class Sizes:
+    """What an episode's frames do not hold: radii of a bar and of the circle around a waypoint (m)."""
+
+    bar_radius_m: float = RobotSettings().bar_radius_m
+    waypoint_radius_m: float = HALF_DIAMETER_M
+
+
+USUAL = Sizes()
 
 
 @dataclass(frozen=True)
@@ -98,9 +106,9 @@ class Scene:
     face: Ints
     kind: Ints
     waypoint: Array
-    waypoint_radius_m: float
     time_s: Array
     forward_speed_m_per_s: Array
+    sizes: Sizes
 
     def camera(self, step: int, size: tuple[int, int]) -> Camera:
         """The camera of a row, for pictures of `size` (width, height) in rays."""
@@ -120,8 +128,8 @@ class Scene:
         top = foot + [0.0, 0.0, FLAG_HEIGHT_M]
         point = np.array([0.0, 0.0, 1e-4])  # a rod needs some length, even where the robot has not moved
         pieces = (
-            (first, second, 0.8 * BAR_RADIUS_M, BAR),
-            (ends, caps, 1.1 * BAR_RADIUS_M, CAP),
+            (first, second, 0.8 * self.sizes.bar_radius_m, BAR),
+            (ends, caps, 1.1 * self.sizes.bar_radius_m, CAP),
             (nodes[CABLES[:, 0]], nodes[CABLES[:, 1]], CABLE_RADIUS_M, CABLE),
             (foot, top, POLE_RADIUS_M, POLE),
             (top, top + point, BALL_RADIUS_M, TRACK),
@@ -143,9 +151,7 @@ class Scene:
         return np.column_stack([x, y, self.landscape.height(x, y) + 0.01])
 
 
-def build(
-    frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], waypoint_radius_m: float = HALF_DIAMETER_M
-) -> Scene:
+def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], sizes: Sizes = USUAL) -> Scene:
     """The scene of an episode's `frames` on its ground (None: flat), seen from where the rows `steps` are seen best."""
     positions, orientations = (
         np.asarray(schema.array(frames, name), dtype=np.float64).reshape(-1, BARS_N, n)
@@ -173,9 +179,9 @@ def build(
         face=np.asarray(schema.array(frames, "face"), dtype=np.int64),
         kind=np.asarray(schema.array(frames, "kind"), dtype=np.int64),
         waypoint=waypoint,
-        waypoint_radius_m=waypoint_radius_m,
         time_s=time_s,
         forward_speed_m_per_s=_numbers(frames, "forward_speed_m_per_s"),
+        sizes=sizes,
     )
 
 
