@@ -44,6 +44,7 @@ def _lead_nowhere(number: int) -> None:
     if nowhere != number:
         os.dup2(nowhere, number)
         os.close(nowhere)
+    os.set_inheritable(number, True)  # for the processes that this one starts
 
 
 def _writer(number: int, before: TextIO | None) -> TextIO:

@@ -10,6 +10,7 @@ from itertools import chain
 import duckdb
 
 from t6gps.storage import schema
+from t6gps.storage.errors import QueryError
 
 MESSAGE_LENGTH_N = 10_000
 
@@ -30,7 +31,7 @@ def refusal(found: Sequence[str]) -> str:
             "this SQL is refused: it takes several statements, as a PIVOT does whose values are not named; "
             "name them: PIVOT episodes ON ended_by IN ('completed') USING count(*)"
         )
-    return f"this SQL is refused: found {', '.join(found) or 'nothing'}"
+    return f"this SQL is refused: found {', '.join(found) or 'nothing'}\n{_ALLOWED}"
 
 
 def explained(error: Exception, sql: str) -> str:
@@ -46,7 +47,7 @@ def explained(error: Exception, sql: str) -> str:
         columns = {table: schema.TABLES[table].names for table in asked}
         guess = "" if "Candidate" in message else _nearest(wrong[1], chain(*columns.values()))
         return f"{message}\n{guess}" + "\n".join(f"{table}: {', '.join(names)}" for table, names in columns.items())
-    if isinstance(error, duckdb.BinderException):
+    if isinstance(error, duckdb.BinderException | QueryError):  # they say themselves what to do
         return message
     return f"{message}\n{_ALLOWED}"
 

@@ -72,6 +72,12 @@ def test_a_closed_error_stream_changes_neither_result_nor_exit_code(root: Path) 
     assert (refused.returncode, refused.stdout) == (2, b"")
 
 
+def test_processes_that_a_command_starts_have_standard_streams_too() -> None:
+    program = "from t6gps.service.cli import streams; streams.prepare(); import os; os.execlp('echo', 'echo')"
+    closed = ["sh", "-c", '"$@" >&-', "sh", sys.executable, "-c", program]
+    assert subprocess.run(closed, check=False, capture_output=True).stderr == b""
+
+
 def test_an_output_that_is_full_is_told_of(root: Path) -> None:
     for command in ("runs", "csv"):
         done = shell(">/dev/full", root, COMMANDS[command])
