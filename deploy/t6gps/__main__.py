@@ -15,6 +15,9 @@ def use_one_thread() -> None:
 
 def main() -> None:
     """Entry point of the command. SIGTERM stops it as Ctrl-C does."""
+    from t6gps.service.cli import streams
+
+    streams.prepare()
     use_one_thread()
     signal.signal(signal.SIGTERM, signal.default_int_handler)
     from t6gps.service.cli.main import main as command_line  # it loads numpy

@@ -47,7 +47,10 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; `t6gps.__main__` has prepared the process, whose arguments are taken where none are given."""
     try:
-        app(arguments)
+        try:
+            app(arguments)
+        finally:
+            sys.stdout.flush()  # a full disk is told of below
     except T6GpsError as error:
         message = str(error)
     except OSError as error:
