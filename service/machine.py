@@ -23,8 +23,9 @@ TEMPORARY_BYTES = 64 * MEBIBYTE
 STORE_BYTES, LEAST_STORE_BYTES = 2048 * MEBIBYTE, 128 * MEBIBYTE
 """What Ray's object store shall have, and what a run needs: 32 long episodes."""
 SHARED = Path("/dev/shm")
-DESCRIPTORS_N, DESCRIPTORS_PER_WORKER_N = 400, 20
-"""Open files and connections of the process that has most of them, Ray's node manager."""
+DESCRIPTORS_N, DESCRIPTORS_PER_WORKER_N = 150, 10
+"""Open files and connections of the process that has most of them, Ray's node manager: 82 with two workers, 121 with
+eight."""
 
 
 @dataclass(frozen=True)

@@ -112,8 +112,8 @@ class PolicyServer:
         if not self._pong.done():
             if silent_s > self._patience_s:
                 self._replace("does not answer")
-        elif self._pong.exception() is not None:
-            self._replace("has died")
+        elif (error := self._pong.exception()) is not None:
+            self._replace(f"has died: {' '.join(str(error).split())}")
         else:
             self.process = self._pong.result()
             if silent_s > self._timings.ping_s:

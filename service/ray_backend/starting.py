@@ -8,12 +8,11 @@ from __future__ import annotations
 
 import logging
 import os
-import signal
 import threading
 import time
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
@@ -89,7 +88,5 @@ def _end_what_is_left(before: set[int]) -> None:
         left = [pid for pid in new if folder in (command := processes.command(pid)) or "ray::" in command]
         if not left:
             return
-        for pid in left:
-            with suppress(ProcessLookupError):  # it has ended meanwhile
-                os.kill(pid, signal.SIGKILL)
+        processes.end(left)
         time.sleep(0.02)

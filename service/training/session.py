@@ -112,7 +112,7 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
             catalog.discard_unused(run)
             raise
         with closing(started) as executor:
-            result = _trained_and_evaluated(config, run, executor, observer)
+            result = train_and_evaluate(config, run, executor, observer)
             executor.close(RunState.DONE)
         evaluation.keep(run, result)
         return result
@@ -129,8 +129,11 @@ def _named(run: Run) -> Iterator[None]:
         raise
 
 
-def _trained_and_evaluated(config: Config, run: Run, executor: Executor, observer: Observer) -> Evaluation:
-    """A learner that dies after the last iteration is replaced, as one that dies before."""
+def train_and_evaluate(config: Config, run: Run, executor: Executor, observer: Observer) -> Evaluation:
+    """Train what is missing of a run, then evaluate its policy without noise.
+
+    A learner that dies after the last iteration is replaced, as one that dies before.
+    """
     deaths_n, size = 0, config.run
     while True:
         loop.train(config, run, executor, observer)
