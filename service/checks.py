@@ -69,7 +69,7 @@ def require(checks: Iterable[Check], wanted: Wanted) -> None:
     for check in checks:
         finding = check(wanted)
         if finding.stops and not finding.good:
-            raise RunError(f"{finding.check}: found {finding.found}, needed {finding.needed}; {finding.remedy}")
+            raise RunError(f"{finding.check}: {finding.found}; needed: {finding.needed}; {finding.remedy}")
 
 
 def cluster_address() -> str | None:
@@ -237,7 +237,7 @@ def cluster(_: Wanted) -> Finding:
         socket.create_connection((host.strip("[]"), int(port)), ANSWER_DEADLINE_S).close()
     except (OSError, OverflowError) as error:
         remedy = "start its head (ray start --head), correct the address, or unset it to use this machine alone"
-        return Finding("RAY_ADDRESS", f"no Ray that answers at {address} ({error})", needed, remedy)
+        return Finding("RAY_ADDRESS", f"no Ray answers at RAY_ADDRESS={address} ({error})", needed, remedy)
     return Finding("RAY_ADDRESS", f"{address} answers", needed)
 
 

@@ -30,9 +30,10 @@ def open_closed_streams() -> None:
 def leave(code: int) -> NoReturn:
     """End this process; at once, with all that it started, when a start of Ray was given up: its thread waits in C."""
     from t6gps.service.caller import STARTING
-    from t6gps.service.ray_backend import processes
 
     if any(thread.name == STARTING for thread in threading.enumerate()):
+        from t6gps.service.ray_backend import processes
+
         for stream in (sys.stdout, sys.stderr):
             stream.flush()
         processes.end(processes.descendants(os.getpid()))

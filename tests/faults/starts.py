@@ -77,7 +77,7 @@ CONDITIONS = (
     Condition("no loopback interface", 'exec unshare -rn "$@"', r"loopback.*ip link set lo up.*--serial", NET),
     Condition("a long TMPDIR", f'mkdir {LONG}; TMPDIR=$PWD/{LONG} exec "$@"'),
     Condition("a TMPDIR that is not there", 'TMPDIR=$PWD/none/none exec "$@"'),
-    Condition("at most 64 open files", 'ulimit -n 64; exec "$@"', r"open files.*found 64.*ulimit -n", quick=True),
+    Condition("at most 64 open files", 'ulimit -n 64; exec "$@"', r"open files: 64; needed.*ulimit -n", quick=True),
     Condition("at most 256 open files", 'ulimit -n 256; exec "$@"'),
     Condition("at most 1,024 open files", 'ulimit -n 1024; exec "$@"'),
     Condition("a soft limit of 64 open files", 'ulimit -Sn 64; exec "$@"'),
@@ -89,7 +89,7 @@ CONDITIONS = (
     Condition("RAY_ADDRESS=local", environment={"RAY_ADDRESS": "local"}),
     Condition(
         "RAY_ADDRESS where nobody listens",
-        says=r"no Ray that answers at 127\.0\.0\.1:1 .*ray start --head",
+        says=r"no Ray answers at RAY_ADDRESS=127\.0\.0\.1:1 .*ray start --head",
         environment={"RAY_ADDRESS": "127.0.0.1:1"},
         quick=True,
     ),

@@ -25,7 +25,7 @@ def test_nothing_stops_a_start_on_this_machine() -> None:
 
 
 def test_the_first_fault_stops_a_start_with_what_was_found_what_is_needed_and_what_helps() -> None:
-    with pytest.raises(RunError, match=r"open files: found \d+, needed \d{9,} for .* workers; raise the hard limit"):
+    with pytest.raises(RunError, match=r"open files: \d+; needed: \d{9,} for .* workers; raise the hard limit"):
         checks.require(checks.OWN_RAY, Wanted(10**8))
 
 

@@ -24,11 +24,18 @@ def connect() -> None:
         pass
 
 
+@pytest.mark.parametrize("address", ["head", "head:", ":6379", "head:ray", "ray://head:10001"])
+def test_what_is_no_address_of_a_head_is_refused(address: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("RAY_ADDRESS", address)
+    with pytest.raises(RunError, match=r"RAY_ADDRESS: .*; needed: HOST:PORT of a cluster's head, or auto"):
+        connect()
+
+
 def test_an_address_at_which_nobody_listens_is_refused_at_once(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
     monkeypatch.setenv("RAY_ADDRESS", f"127.0.0.1:{port}")
-    with pytest.raises(RunError, match=f"no Ray that answers at 127.0.0.1:{port}"):
+    with pytest.raises(RunError, match=f"no Ray answers at RAY_ADDRESS=127.0.0.1:{port}"):
         connect()
     assert not ray.is_initialized()
 
