@@ -13,7 +13,7 @@ import socket
 import sys
 import tempfile
 from collections.abc import Callable, Iterable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from importlib import metadata
 from pathlib import Path
 
@@ -70,6 +70,15 @@ def require(checks: Iterable[Check], wanted: Wanted) -> None:
         finding = check(wanted)
         if finding.stops and not finding.good:
             raise RunError(f"{finding.check}: {finding.found}; needed: {finding.needed}; {finding.remedy}")
+
+
+def look(wanted: Wanted) -> list[Finding]:
+    """What all checks find. What matters to a Ray of one's own alone stops no start where RAY_ADDRESS names another."""
+    joins = cluster_address() is not None
+    return [
+        replace(check(wanted), stops=False) if joins and check in OWN_RAY and check not in CLUSTER else check(wanted)
+        for check in ALL
+    ]
 
 
 def cluster_address() -> str | None:

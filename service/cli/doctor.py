@@ -29,7 +29,7 @@ def doctor(
     as_json: Json = False,
 ) -> None:
     """Check this machine: what a run needs, what was found, what helps. Exits with 2 where no run would start."""
-    findings = [check(Wanted(workers, root)) for check in checks.ALL]
+    findings = checks.look(Wanted(workers, root))
     stopped = [finding.check for finding in findings if finding.stops and not finding.good]
     if as_json:
         typer.echo(json.dumps({"starts": not stopped, "checks": [_row(finding) for finding in findings]}))
