@@ -109,8 +109,9 @@ CONDITIONS = (
     ),
     Condition(
         "RAY_ADDRESS=auto without a cluster",
-        'TMPDIR=$PWD exec "$@"',  # Ray notes there which cluster there is
+        'TMPDIR=$PWD exec unshare -rpf --mount-proc "$@"',  # Ray looks there, and at all processes of the machine
         says=r"ray start --head.*unset",
+        needs="unshare -rpf --mount-proc true",
         environment={"RAY_ADDRESS": "auto"},
     ),
     Condition(
