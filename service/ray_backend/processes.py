@@ -66,6 +66,15 @@ def kill(process: Process) -> None:
             os.kill(process.pid, signal.SIGKILL)
 
 
+def started(pid: int) -> int | None:
+    """When a process of this machine started, in ticks since boot; None when it has ended."""
+    try:
+        state, when = _stat(pid)
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return None if state == "Z" else when
+
+
 def log_tail(folder: Path, pid: int) -> str:
     """The end of what a process of this machine wrote to its logs in `folder`."""
     text = ""
