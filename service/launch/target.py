@@ -71,7 +71,7 @@ def parse(kind: Kind, values: object, where: str) -> Target:
         raise ConfigError(f"{where}: [{kind}]: {error}; use numbers, strings and booleans") from None
     except ValidationError as error:
         faults = [
-            f"{kind}.{'.'.join(map(str, item['loc']))}: {item['msg']}, found {item['input']!r}"
+            f"{'.'.join([kind.value, *map(str, item['loc'])])}: {item['msg']}, found {item['input']!r}"
             for item in error.errors()
         ]
         allowed = ", ".join(f"{name} ({field.description})" for name, field in known.model_fields.items())
