@@ -96,6 +96,8 @@ def fetch(source: Source, root: Path, name: str, progress: Callable[[int, int], 
         durable.sync_tree(draft)
         if not durable.claim(draft, path):
             raise RunError(f"{path} exists already; choose another name with --run")
+        if not any(draft.parent.iterdir()):
+            draft.parent.rmdir()
     except OSError as error:
         raise RunError(f"cannot fetch run {name} to {root}: {error}; make room, then fetch it again") from error
     return Run(path)

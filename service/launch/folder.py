@@ -61,6 +61,10 @@ class Folder:
         except (FileNotFoundError, ValueError):
             return None
 
+    def end(self, exit_code: int) -> None:
+        """Say how a job ended that cannot say it itself."""
+        (self.path / "exit_code").write_text(f"{exit_code}\n")
+
 
 def of(root: Path, run: str) -> Folder:
     """The folder of the job that trains a run, whether it is there or not."""

@@ -31,7 +31,8 @@ class JobState(StrEnum):
 
 
 ENDED = (JobState.DONE, JobState.STOPPED, JobState.FAILED)
-OUTCOMES = {0: JobState.DONE, 130: JobState.STOPPED}
+STOPPED = 130
+OUTCOMES = {0: JobState.DONE, STOPPED: JobState.STOPPED}
 """What exit codes of a job mean; all others mean that it failed."""
 
 

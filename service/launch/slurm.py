@@ -12,7 +12,7 @@ from pathlib import Path
 
 from t6gps.service.config import Config
 from t6gps.service.launch.folder import Folder
-from t6gps.service.launch.job import Job, JobState, outcome
+from t6gps.service.launch.job import STOPPED, Job, JobState, outcome
 from t6gps.service.launch.target import Slurm
 from t6gps.service.launch.visible import VisibleLauncher
 from t6gps.storage.errors import ConfigError, RunError
@@ -69,8 +69,9 @@ class SlurmLauncher(VisibleLauncher):
         return outcome(job.folder)
 
     def stop(self, job: Job) -> None:
-        if self.state(job)[0] is JobState.PENDING:
+        if self.state(job)[0] is JobState.PENDING:  # nothing runs that could stop, or say so
             self.cancel(job)
+            job.folder.end(STOPPED)
         else:  # to the script alone, which stops the run; Slurm would send it to Ray first
             _cancelled("--batch", "--signal=TERM", job.native_id)
 

@@ -53,10 +53,10 @@ class Desk:
         assert done.returncode == code, done.stderr + done.stdout
         return done
 
-    def submit(self, run: str, *arguments: str, nodes: int = 2, code: int = 0) -> str:
-        """Submit a run on as many nodes; what is printed, errors included."""
-        target = self.folder / f"{nodes}.toml"
-        target.write_text(f"[slurm]\npartition = 'all'\nnodes = {nodes}\ncpus_per_node = 1\n")
+    def submit(self, run: str, *arguments: str, nodes: int = 2, cpus: int = 1, code: int = 0) -> str:
+        """Submit a run on as many nodes and CPUs of each; what is printed, errors included."""
+        target = self.folder / "targets.toml"
+        target.write_text(f"[slurm]\npartition = 'all'\nnodes = {nodes}\ncpus_per_node = {cpus}\n")
         options = ["--to", "slurm", "--target", target, "--run", run, *arguments]
         done = self.t6gps("submit", "flat-quick", *options, code=code)
         return done.stdout + " ".join(done.stderr.split())
@@ -112,7 +112,7 @@ def fail_node(desk: Desk, run: str) -> None:
     """Set the second node down; it comes back when the job has lost it."""
     desk.cluster.asked("scontrol", "update", "nodename=t6n2", "state=down", "reason=test")
     wait_until(lambda: not running(desk, run), 60.0)
-    wait_until(lambda: resumed(desk), 60.0)
+    wait_until(lambda: resumed(desk), 180.0)
 
 
 def resumed(desk: Desk) -> bool:
@@ -161,8 +161,12 @@ def test_a_job_stops_cleanly_and_is_resumed_by_another(desk: Desk, expected: dic
     wait_until(lambda: desk.learned("stopped"), ENDS_S)
     refused = desk.submit("stopped", *LONG, "--resume", code=2)
     assert "in use" in refused or "is running" in refused
-    desk.t6gps("stop", "stopped")
+    desk.submit("waiting", *LONG, cpus=2)
+    assert desk.state("waiting") == "pending"
+    for run in ("waiting", "stopped"):
+        assert f"job {run} is stopped" in desk.t6gps("stop", run).stdout
     assert desk.ended("stopped") == "stopped"
+    assert not (desk.root / "waiting").exists()
     assert "everything sampled so far is kept" in desk.t6gps("logs", "stopped").stdout
     desk.submit("stopped", *LONG, "--resume")
     assert desk.ended("stopped") == "done"
