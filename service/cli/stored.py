@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Sequence
 from enum import StrEnum
 from pathlib import Path
@@ -101,7 +102,11 @@ def query(
     form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
 ) -> None:
     """Query a run's stored trajectories with SQL."""
-    terminal.write_table(sql_query.query(catalog.open_run(root, run_name), sql), form.value)
+    run = catalog.open_run(root, run_name)
+    if form is QueryFormat.TABLE:
+        terminal.print_head(sql_query.head(run, sql))
+    else:
+        sql_query.write(run, sql, form.value, sys.stdout.buffer)
 
 
 def render(

@@ -44,9 +44,8 @@ class LocalLauncher(VisibleLauncher):
 
     def cancel(self, job: Job) -> None:
         pid = _pid(job)
-        for doomed in [] if pid is None else [pid, *processes.descendants(pid)]:
-            with suppress(ProcessLookupError):
-                os.kill(doomed, signal.SIGKILL)
+        if pid is not None:
+            processes.end([pid, *processes.descendants(pid)])
 
 
 def _call(folder: Folder) -> list[str]:

@@ -19,7 +19,7 @@ from t6gps.service.execution.serial import new_learner
 from t6gps.service.studies import arm_figures, baselines, conduct, declared, ground_figures, report
 from t6gps.service.studies.conduct import Finished, Trial
 from t6gps.service.studies.declared import PAPER, STUDIES, Arm, Baseline, Scale, Study
-from t6gps.service.studies.origin import FILE, Origin, origin, recorded
+from t6gps.service.studies.origin import EARLIER_FILE, FILE, Origin, origin, recorded
 from t6gps.service.training import evaluation
 from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
@@ -225,7 +225,10 @@ def test_an_origin_adds_up_the_commits_and_the_time_of_each_part(tmp_path: Path)
             pass
     with pytest.raises(KeyboardInterrupt), recorded(run, "pair", "short", 0, "c"):
         raise KeyboardInterrupt
-    assert origin(run) == Origin("pair", "short", 0, ("a", "b", "c"), origin(run).wall_s, os.cpu_count())
+    found = origin(run)
+    assert found == Origin("pair", "short", 0, ("a", "b", "c"), found.wall_s, os.cpu_count())
+    (run.path / FILE).rename(run.path / EARLIER_FILE)
+    assert origin(run) == found
 
 
 @pytest.mark.parametrize(
