@@ -71,7 +71,7 @@ class Cluster:
     @property
     def environment(self) -> dict[str, str]:
         """Variables that lead Slurm's programs to it, and its jobs to a folder for temporary files."""
-        return {**os.environ, "SLURM_CONF": str(self.folder / "slurm.conf"), "TMPDIR": str(self.folder / "tmp")}
+        return {**os.environ, "SLURM_CONF": str(self.folder / "slurm.conf"), "TMPDIR": str(self.folder / "t")}
 
     def call(self, *command: str | Path) -> subprocess.CompletedProcess[str]:
         """A command inside the namespace, with the programs of Slurm at hand."""
@@ -97,7 +97,7 @@ class Cluster:
 @contextmanager
 def started(folder: Path) -> Iterator[Cluster]:
     """A cluster that is up, and down again at the end with all that it ran."""
-    for name in ("munge", "state", "log", "tmp", *(f"spool/{node}" for node in NODES)):
+    for name in ("munge", "state", "log", "t", *(f"spool/{node}" for node in NODES)):
         (folder / name).mkdir(parents=True)
     (folder / "munge").chmod(0o755)
     _write(folder / "munge" / "key", secrets.token_hex(512), 0o600)

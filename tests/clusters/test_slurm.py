@@ -28,7 +28,7 @@ pytestmark = [
     ),
 ]
 
-LONG = [*tiny_run.settings(), "--set=run.iterations=12"]
+LONG = [*tiny_run.settings(), "--set=run.iterations=20"]
 """Long enough that a job can be interrupted after its first checkpoint."""
 ENDS_S = 300.0
 
@@ -159,18 +159,25 @@ def test_jobs_of_an_array_share_a_node_and_each_trains_its_seed(desk: Desk) -> N
 def test_a_job_stops_cleanly_and_is_resumed_by_another(desk: Desk, expected: dict[str, str]) -> None:
     desk.submit("stopped", *LONG)
     wait_until(lambda: desk.learned("stopped"), ENDS_S)
-    refused = desk.submit("stopped", *LONG, "--resume", code=2)
-    assert "in use" in refused or "is running" in refused
-    desk.submit("waiting", *LONG, cpus=2)
-    assert desk.state("waiting") == "pending"
-    for run in ("waiting", "stopped"):
-        assert f"job {run} is stopped" in desk.t6gps("stop", run).stdout
+    assert "job stopped is stopped" in desk.t6gps("stop", "stopped").stdout
     assert desk.ended("stopped") == "stopped"
-    assert not (desk.root / "waiting").exists()
     assert "everything sampled so far is kept" in desk.t6gps("logs", "stopped").stdout
     desk.submit("stopped", *LONG, "--resume")
     assert desk.ended("stopped") == "done"
     assert desk.digests("stopped") == expected
+
+
+def test_a_job_that_waits_is_in_the_way_of_another_and_stops_before_it_starts(desk: Desk) -> None:
+    log = desk.folder / "other.log"
+    other = desk.cluster.asked("sbatch", "--parsable", "-N2", "-c2", f"--output={log}", "--wrap=sleep 600").strip()
+    desk.submit("waiting", *tiny_run.settings())
+    assert desk.state("waiting") == "pending"
+    refused = desk.submit("waiting", *tiny_run.settings(), "--resume", code=2)
+    assert "job waiting is pending" in refused
+    assert "job waiting is stopped" in desk.t6gps("stop", "waiting").stdout
+    desk.cluster.asked("scancel", other)
+    assert desk.ended("waiting") == "stopped"
+    assert not (desk.root / "waiting").exists()
 
 
 def test_a_job_that_is_cancelled_leaves_nothing_running(desk: Desk) -> None:
