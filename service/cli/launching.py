@@ -26,6 +26,7 @@ from t6gps.storage.errors import RunError, T6GpsError
 
 STOP_S, CANCEL_S, TICK_S = 60.0, 60.0, 0.2
 """How long a job has to stop cleanly and then to be ended, and how often it is looked at."""
+INTERRUPTED = 130
 JOB_COLUMNS = {
     "name": ("job", "{}"),
     "kind": ("on", "{}"),
@@ -92,8 +93,11 @@ def logs(
 ) -> None:
     """Print what a job has written."""
     job = submission.named(root, name)
-    for text in launchers.serving(job).logs(job, follow):
-        typer.echo(text, nl=False)
+    try:
+        for text in launchers.serving(job).logs(job, follow):
+            typer.echo(text, nl=False)
+    except KeyboardInterrupt:  # of the watching; the job goes on
+        raise typer.Exit(INTERRUPTED) from None
 
 
 def stop(name: JobName, root: Root = DEFAULT_ROOT) -> None:

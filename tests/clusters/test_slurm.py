@@ -79,7 +79,7 @@ class Desk:
     def ended(self, run: str) -> str:
         """Wait until a job has ended and nothing of it runs; how it ended."""
         wait_until(lambda: not self.cluster.asked("squeue", "-h"), ENDS_S)
-        wait_until(lambda: not self.cluster.of_jobs(), 30.0)
+        wait_until(lambda: not self.cluster.of_jobs(), ENDS_S)
         return self.state(run)
 
     def digests(self, run: str) -> dict[str, str]:
@@ -94,6 +94,14 @@ def desk() -> Iterator[Desk]:
             yield Desk(cluster, folder)
     finally:
         shutil.rmtree(folder)
+
+
+@pytest.fixture(autouse=True)
+def no_job_left(desk: Desk) -> Iterator[None]:
+    """The jobs of a test end with it, also where it fails."""
+    yield
+    desk.cluster.asked("scancel", "--full", "--user=root")
+    wait_until(lambda: not desk.cluster.of_jobs(), ENDS_S)
 
 
 @pytest.fixture(scope="module")
@@ -135,7 +143,7 @@ def test_a_job_on_two_nodes_that_is_interrupted_resumes_to_the_same_bytes(
     interrupt(desk, run)
     number = desk.number(run)
     wait_until(lambda: "PENDING" in desk.cluster.asked("squeue", "-h", "-o", "%T", "-j", number), 60.0)
-    assert not desk.cluster.of_jobs()
+    wait_until(lambda: not desk.cluster.of_jobs(), 60.0)
     assert desk.state(run) == "pending"
     desk.cluster.asked("scontrol", "update", f"jobid={number}", "StartTime=now")  # Slurm would wait for two minutes
     assert desk.ended(run) == "done"

@@ -20,6 +20,7 @@ from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
 from t6gps.service.launch.job import ENDED, Job
 from t6gps.service.ray_backend import processes
+from t6gps.storage import catalog
 
 pytestmark = [pytest.mark.slow, pytest.mark.ray]
 LONG = [*tiny_run.settings(), "--set=run.iterations=2000"]
@@ -85,6 +86,7 @@ def test_a_job_that_is_killed_is_failed_and_resumes(tiny: Trained, tmp_path: Pat
         os.kill(pid, signal.SIGKILL)
     wait_until(lambda: state("tiny", root)["state"] in ENDED, 60.0)
     assert state("tiny", root)["detail"].startswith("ended without a word")
+    wait_until(lambda: catalog.process_of(catalog.open_run(root, "tiny")) is None, 60.0)
     t6gps("submit", "flat-quick", "--run", "tiny", "--resume", "--root", root, *tiny_run.settings())
     t6gps("logs", "-f", "tiny", "--root", root)
     assert state("tiny", root)["state"] == "done"
@@ -97,4 +99,4 @@ def test_a_job_that_cannot_train_says_why(tmp_path: Path, monkeypatch: pytest.Mo
     t6gps("logs", "-f", "a", "--root", tmp_path)
     known = state("a", tmp_path)
     assert known["state"] == "failed"
-    assert known["detail"].startswith("error: no Ray answers")
+    assert known["detail"].startswith("error: RAY_ADDRESS: no Ray answers")
