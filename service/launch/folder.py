@@ -100,6 +100,8 @@ def prepared(config: Config, folder: Folder) -> Iterator[None]:
         with durable.draft(folder.path) as draft:
             _write(config, folder, draft)
             durable.sync_tree(draft)
+            if before.exists():  # of a submission that was cut off
+                durable.discard(before)
             if folder.path.exists():
                 _keep_log(folder.path, draft)
                 folder.path.replace(before)
