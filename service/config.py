@@ -70,6 +70,11 @@ class Config(RolloutSettings):
         """The configuration as the run keeps it; options that are none do not stand in it."""
         return self.model_dump_json(indent=2, exclude_none=True) + "\n"
 
+    def to_toml(self) -> str:
+        """The configuration as a file that `load` takes: a line for each key, whose values TOML writes as JSON does."""
+        values = _flat(self.model_dump(mode="json", exclude_none=True))
+        return "".join(f"{key} = {json.dumps(value, ensure_ascii=False)}\n" for key, value in values.items())
+
 
 def presets() -> list[str]:
     """Names of the presets that ship with the package."""

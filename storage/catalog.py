@@ -222,6 +222,11 @@ def open_run(root: Path, name: str) -> Run:
     raise RunError(f"there is no run {name!r} in {root}; {hint}runs: {', '.join(names)}")
 
 
+def exists(root: Path, name: str) -> bool:
+    """True when there is a run `name` under `root`, damaged or not. RunError for a name that none can have."""
+    return _is_run(Run(whole(root) / check_name(name)))
+
+
 def list_runs(root: Path) -> list[Run]:
     """All runs under `root` by name, damaged ones included; none when the root does not exist."""
     root = whole(root)

@@ -53,13 +53,15 @@ def test_the_package_has_a_room_for_each_folder_and_its_own_modules_lie_in_deplo
 
 
 @pytest.mark.slow
-def test_the_wheel_holds_every_module_preset_and_the_plugin(wheel: Path) -> None:
+def test_the_wheel_holds_every_module_preset_script_and_the_plugin(wheel: Path) -> None:
     names = set(zipfile.ZipFile(wheel).namelist())
     for package in SETUPTOOLS["packages"]:
         for module in folder_of(package).glob("*.py"):
             assert f"{package.replace('.', '/')}/{module.name}" in names
     for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
         assert f"t6gps/deploy/presets/{preset.name}" in names
+    for script in ("launch/train.sh", "slurm/train.sbatch"):
+        assert f"t6gps/deploy/{script}" in names
     for module in SETUPTOOLS["ext-modules"]:
         assert f"{module['name'].replace('.', '/')}{sysconfig.get_config_var('EXT_SUFFIX')}" in names
     assert all(name.startswith(("t6gps/", "t6gps-")) for name in names)

@@ -80,12 +80,12 @@ def train(
     settings   dotted keys and values, such as {"run.iterations": 2}
     workers    rollout workers on Ray; they change the speed, never the data
     serial     in this process, without Ray; the same data
-    resume     continue the run of that name, with the same settings
+    resume     continue the run of that name, with the same settings; start it where it is not there yet
     progress   called with each `Progress`
 
     Without `serial`, workers run on the Ray that the caller is connected to, which is left running; else on the cluster
     of RAY_ADDRESS; else on one that is started for the run. ConfigError for a source or a setting that cannot be used,
-    RunError for a run that exists, does not exist, or cannot be started.
+    RunError for a run that exists, or cannot be started.
     """
     source, folder = fspath(source), Path(root)
     config = configuration.load(source, _overrides(settings, workers))

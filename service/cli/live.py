@@ -10,8 +10,11 @@ from typing import Annotated
 import typer
 
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
+from t6gps.service.launch import job as records
+from t6gps.service.launch import launchers
 from t6gps.service.pool import control, crash_bundle
 from t6gps.service.pool.attempt import Failure
+from t6gps.service.pool.control import Status
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
@@ -43,13 +46,32 @@ def scale(
     ),
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
-    reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
+    job = records.find(root, run_name)
+    if job is None:
+        reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
+    else:
+        reached = launchers.serving(job).scale(job, workers, deadline_s)
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
 def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    state = control.status(catalog.open_run(root, run_name))
+    job = records.find(root, run_name)
+    if job is None:
+        _print_status(run_name, control.status(catalog.open_run(root, run_name)), as_json)
+        return
+    launcher = launchers.serving(job)
+    known, (state, detail) = launcher.status(job), launcher.state(job)
+    if as_json:
+        typer.echo(json.dumps({"job": {"name": job.name, "state": state, "detail": detail}, **(known or {})}))
+        return
+    typer.echo(f"job {job.name} on {job.kind} ({job.native_id}): {state}" + (f", {detail}" if detail else ""))
+    if known is not None:
+        _print_status(job.run, known, as_json)
+
+
+def _print_status(run_name: str, state: Status, as_json: bool) -> None:
+    """Print how a run is, in lines and a table of its workers, or as JSON."""
     if as_json:
         typer.echo(json.dumps(state))
         return

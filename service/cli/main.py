@@ -1,8 +1,8 @@
 """The command line `t6gps`. Results go to stdout, progress and messages to stderr; bad input exits with 2.
 
 This module has the commands that start something: train, study, eval, bench. `stored` has those that read what is
-there, `live` those for a run that is running. What is slow to import (ray, torch, matplotlib) is imported by the
-commands that need it, so that the others answer at once.
+there, `live` those for a run that is running, `launching` those for jobs. What is slow to import (ray, torch,
+matplotlib) is imported by the commands that need it, so that the others answer at once.
 """
 
 from __future__ import annotations
@@ -19,7 +19,7 @@ import typer
 from t6gps.service import advice
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import doctor, live, stored
+from t6gps.service.cli import doctor, launching, live, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -72,7 +72,9 @@ def train(
     workers: Workers = None,
     autoscale: Autoscale = None,
     serial: Serial = False,
-    resume: Annotated[bool, typer.Option("--resume", help="Continue an interrupted run.")] = False,
+    resume: Annotated[
+        bool, typer.Option("--resume", help="Continue an interrupted run; start one that is not there yet.")
+    ] = False,
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
@@ -176,6 +178,7 @@ def bench(
 
 stored.add_to(app)
 live.add_to(app)
+launching.add_to(app)
 doctor.add_to(app)
 
 

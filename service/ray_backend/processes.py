@@ -67,6 +67,15 @@ def kill(process: Process) -> None:
             os.kill(process.pid, signal.SIGKILL)
 
 
+def started(pid: int) -> int | None:
+    """When a process of this machine started, in ticks since boot; None when it has ended."""
+    try:
+        state, when = _stat(pid)
+    except (FileNotFoundError, ProcessLookupError):
+        return None
+    return None if state == "Z" else when
+
+
 def end(pids: Iterable[int]) -> None:
     """End processes of this machine at once; those that have ended already are left alone."""
     for pid in pids:

@@ -79,16 +79,17 @@ def check_unchanged(run: Run, config: Config, remedy: str) -> None:
 
 
 def begin(config: Config, root: Path, name: str | None, default: str, resume: bool, warn: Warn) -> Run:
-    """The run of that name below `root`: a new one, or the one that there is, to `resume` it.
+    """The run of that name below `root`: a new one, or with `resume` the one that there is, if there is one.
 
-    Without a name it is `default`, or the first of default-2, default-3, ... that is free. RunError when the name is
-    taken or refused, when there is nothing to resume, when it has another configuration, or when the root takes no
-    more files. `warn` is told what made the run and is another now.
+    Without a name it is `default`, or without `resume` the first of default-2, default-3, ... that is free. RunError
+    when the name is taken or refused, when the run to resume has another configuration, or when the root takes no more
+    files. `warn` is told what made the run and is another now.
     """
     checks.require((checks.root_folder,), Wanted(config.run.workers, root))
-    if not resume:
-        return origin.create(config, root, default if name is None else name, numbered=name is None)
-    run = catalog.open_run(root, default if name is None else name)
+    chosen = default if name is None else name
+    if not (resume and catalog.exists(root, chosen)):
+        return origin.create(config, root, chosen, numbered=name is None and not resume)
+    run = catalog.open_run(root, chosen)
     tell_changes(run, warn)
     check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
     return run

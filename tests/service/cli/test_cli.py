@@ -101,7 +101,6 @@ def test_resuming_a_finished_run_keeps_it(tiny: Trained, root: Path) -> None:
         (["train", "flat-quick", "--workers", "0"], ["run.workers", "greater than or equal to 1"]),
         (["train", "flat-quick", "--run", "../elsewhere"], ["letters, digits", "../elsewhere"]),
         (["train", "flat-quick", "--run", "tiny"], ["exists already", "--resume"]),
-        (["train", "flat-quick", "--run", "none", "--resume"], ["no run 'none'", "tiny"]),
         (["train", "flat-quick", "--run", "tiny", "--resume", *TINY, "--set=learner.epochs=3"],
          ["learner.epochs = 3", "the run has 2"]),
         (["train", "flat-quick", "--set", "robot.bar_mass_kg=20"], ["stance collapses", "robot.pretension_n"]),

@@ -1,0 +1,56 @@
+"""The port `Launcher`: what is asked of a target, the same for all kinds; and which kind has which leaf."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from typing import Protocol
+
+from t6gps.service.config import Config
+from t6gps.service.launch.fetch import Source
+from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.job import Job, JobState
+from t6gps.service.pool.control import Status
+
+
+class Launcher(Protocol):
+    """A target on which jobs run. Every method raises RunError where the target cannot be used or reached."""
+
+    def check(self, config: Config) -> None:
+        """ConfigError or RunError for a run that this target cannot take; nothing is changed."""
+        ...
+
+    def render(self, folders: Sequence[Folder]) -> str:
+        """What `submit` would do, as commands and files to read."""
+        ...
+
+    def submit(self, folders: Sequence[Folder]) -> list[str]:
+        """Start a job for each of these prepared folders; their numbers on the target."""
+        ...
+
+    def state(self, job: Job) -> tuple[JobState, str]:
+        """How a job is, and where or why in words."""
+        ...
+
+    def logs(self, job: Job, follow: bool) -> Iterator[str]:
+        """What a job has written so far; with `follow` also what it goes on to write, until it ends."""
+        ...
+
+    def stop(self, job: Job) -> None:
+        """Ask a job to stop cleanly; does not wait."""
+        ...
+
+    def cancel(self, job: Job) -> None:
+        """End a job and its processes at once; does not wait."""
+        ...
+
+    def status(self, job: Job) -> Status | None:
+        """How the run of a job is, None where it has no workers yet."""
+        ...
+
+    def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
+        """Give the run of a job `workers` workers, and wait for them; its status then. Errors as `control.scale`."""
+        ...
+
+    def source(self, job: Job) -> Source:
+        """Where the files of the run of a job come from."""
+        ...

@@ -1,0 +1,74 @@
+"""What launchers share whose root this machine sees too: a job's log is a file, and its run is at hand."""
+
+from __future__ import annotations
+
+import time
+from abc import ABC, abstractmethod
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+from t6gps.service.config import Config
+from t6gps.service.launch.fetch import FolderSource, Source
+from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.job import ENDED, Job, JobState
+from t6gps.service.pool import control
+from t6gps.service.pool.control import Status
+from t6gps.storage import catalog
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
+
+TICK_S = 0.2
+
+
+class VisibleLauncher(ABC):
+    """A `Launcher` whose jobs write into a root that this machine sees."""
+
+    @abstractmethod
+    def check(self, config: Config) -> None: ...
+
+    @abstractmethod
+    def render(self, folders: Sequence[Folder]) -> str: ...
+
+    @abstractmethod
+    def submit(self, folders: Sequence[Folder]) -> list[str]: ...
+
+    @abstractmethod
+    def state(self, job: Job) -> tuple[JobState, str]: ...
+
+    @abstractmethod
+    def stop(self, job: Job) -> None: ...
+
+    @abstractmethod
+    def cancel(self, job: Job) -> None: ...
+
+    def logs(self, job: Job, follow: bool) -> Iterator[str]:
+        path = job.folder.log
+        while follow and not path.exists() and self.state(job)[0] not in ENDED:
+            time.sleep(TICK_S)
+        try:
+            with path.open(encoding="utf-8", errors="replace") as file:
+                while True:
+                    ended = not follow or self.state(job)[0] in ENDED
+                    while text := file.read(1 << 16):
+                        yield text
+                    if ended:  # asked before the last reading
+                        return
+                    time.sleep(TICK_S)
+        except FileNotFoundError:
+            raise RunError(f"job {job.name} has no log {path} yet; see t6gps jobs") from None
+
+    def status(self, job: Job) -> Status | None:
+        if not catalog.exists(Path(job.root), job.run):
+            return None
+        run = _run(job)
+        return control.status(run) if (run.pool / "status.json").exists() else None
+
+    def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
+        return control.scale(_run(job), workers, deadline_s)
+
+    def source(self, job: Job) -> Source:
+        return FolderSource(_run(job))
+
+
+def _run(job: Job) -> Run:
+    return catalog.open_run(Path(job.root), job.run)
