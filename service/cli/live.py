@@ -9,11 +9,11 @@ from typing import Annotated
 
 import typer
 
-from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
+from t6gps.service.cli import door
+from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName, Server
 from t6gps.service.pool import control, crash_bundle
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.views import terminal
-from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 
 WORKER_COLUMNS = {
@@ -38,18 +38,21 @@ def scale(
     run_name: RunName,
     workers: Annotated[int, typer.Argument(metavar="N", help="Workers from now on; 0 pauses the run.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for them (s).")] = (
         control.SCALE_DEADLINE_S
     ),
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
-    reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
+    with door.opened(root, server) as runs:
+        reached = runs.scale(run_name, workers, deadline_s)
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
-def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+def status(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    state = control.status(catalog.open_run(root, run_name))
+    with door.opened(root, server) as runs:
+        state = runs.status(run_name)
     if as_json:
         typer.echo(json.dumps(state))
         return

@@ -18,7 +18,7 @@ import typer
 
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import live, stored
+from t6gps.service.cli import live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -169,6 +169,7 @@ def bench(
 
 stored.add_to(app)
 live.add_to(app)
+serving.add_to(app)
 
 
 def _exit_interrupted(command: list[str]) -> NoReturn:

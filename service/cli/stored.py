@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import shlex
 from collections.abc import Sequence
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -12,17 +13,16 @@ import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
-from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName
+from t6gps.service.cli import door
+from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, Server
 from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training.summary import RunSummary
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, RunError, T6GpsError
-from t6gps.storage.sql import query as sql_query
+from t6gps.storage.errors import ConfigError
 
-SUMMARY = ("run", "iterations", "cost", "forward_speed_m_per_s")
-"""What the list of runs says of each."""
 EXPORT_SECTIONS = ("robot.", "terrain.")
 
 
@@ -47,31 +47,21 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def runs(root: Root = DEFAULT_ROOT) -> None:
+def runs(root: Root = DEFAULT_ROOT, server: Server = None) -> None:
     """List the runs."""
-    if not catalog.whole(root).is_dir():
-        raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
-    rows: list[dict[str, object]] = []
-    faults = []
-    for run in catalog.list_runs(root):
-        try:
-            rows.append(_summary(run))
-        except T6GpsError as error:  # one damaged run hides none of the others
-            rows.append(dict.fromkeys(SUMMARY) | {"run": run.name, "iterations": "damaged"})
-            faults.append(str(error))
-    columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
-    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in SUMMARY[2:]}
-    terminal.print_rows(f"Runs in {root}", rows, columns)
-    for fault in faults:
-        typer.echo(f"damaged: {fault}")
+    with door.opened(root, server) as there:
+        summaries = there.runs()
+    columns = {"name": ("run", "{}"), "iterations": ("iterations", "{}")}
+    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
+    rows = [asdict(run) | {"iterations": _iterations(run)} for run in summaries]
+    terminal.print_rows(f"Runs in {root}" if server is None else f"Runs of {server}", rows, columns)
+    for run in summaries:
+        if run.fault is not None:
+            typer.echo(f"damaged: {run.fault}")
 
 
-def _summary(run: Run) -> dict[str, object]:
-    """A run in a line. An error where something of it cannot be read."""
-    planned, done = origin.configured(run).run.iterations, tables.files(run)[0]
-    last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
-    known = {key: last[0][key] for key in SUMMARY[2:]} if last else dict.fromkeys(SUMMARY[2:])
-    return {"run": run.name, "iterations": f"{done} of {planned}", **known}
+def _iterations(run: RunSummary) -> str:
+    return "damaged" if run.fault is not None else f"{run.done} of {run.planned}"
 
 
 def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
@@ -98,10 +88,13 @@ def query(
     run_name: RunName,
     sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT over frames, episodes, iterations, classes.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
 ) -> None:
     """Query a run's stored trajectories with SQL."""
-    terminal.write_table(sql_query.query(catalog.open_run(root, run_name), sql), form.value)
+    with door.opened(root, server) as runs:
+        table = runs.query(run_name, sql)
+    terminal.write_table(table, form.value)
 
 
 def render(
