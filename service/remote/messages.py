@@ -6,9 +6,9 @@ from datetime import datetime
 from enum import StrEnum
 from typing import Annotated
 
-from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, WithJsonSchema
 
-from t6gps.service.config import WORKERS_MOST_N
+from t6gps.service.config import WORKERS_MOST_N, presets
 from t6gps.storage.catalog import NAME_LENGTH_N
 from t6gps.storage.sql.query import SQL_BYTES_N
 
@@ -19,6 +19,7 @@ ARROW = "application/vnd.apache.arrow.stream"
 
 RunName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]*$")]
+Preset = Annotated[str, WithJsonSchema({"type": "string", "enum": presets()})]
 Key = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z_]+(\.[a-z_]+)+$")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
 Text = Annotated[str, StringConstraints(max_length=200)]
@@ -60,7 +61,7 @@ class Health(Message):
 class StartRequest(Message):
     """A run to start: a preset, the run's name (by default the preset's), settings by dotted keys."""
 
-    preset: Annotated[str, StringConstraints(max_length=NAME_LENGTH_N)]
+    preset: Preset
     name: RunName | None = None
     settings: dict[Key, Scalar | list[Scalar]] = Field(default={}, max_length=100)
 

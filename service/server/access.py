@@ -40,6 +40,10 @@ REFUSALS: Answers = {int(status): {"model": Refusal, "description": status.phras
 """How any route may refuse."""
 
 
+class NoSuchRunError(RunError):
+    """A run that is not there."""
+
+
 @final
 class Slots:
     """Room for so much at once. Who finds none is told to come back, and nobody queues."""
@@ -121,7 +125,7 @@ def _named(place: Place, name: Annotated[RunName, Path(description="Name of a ru
     try:
         return catalog.open_run(place.root, name)
     except RunError as error:
-        raise HTTPException(HTTPStatus.NOT_FOUND, str(error)) from None
+        raise NoSuchRunError(*error.args) from None
 
 
 NamedRun = Annotated[Run, Depends(_named)]

@@ -14,12 +14,13 @@ from starlette.exceptions import HTTPException
 
 from t6gps.service.remote.messages import Health
 from t6gps.service.server import administering, jobs, operating, reading
-from t6gps.service.server.access import Served
-from t6gps.service.server.guard import Clock, Guard, refusal, utc_now
+from t6gps.service.server.access import NoSuchRunError, Served
+from t6gps.service.server.guard import Clock, Guard, Limits, refusal, utc_now
 from t6gps.service.server.jobs import Launch
-from t6gps.storage.errors import ConfigError, QueryError, ServerError, T6GpsError
+from t6gps.storage.errors import ConfigError, QueryError, RunError, ServerError, T6GpsError
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
+DEFAULT_LIMITS = Limits()
 _log = logging.getLogger(__name__)
 
 
@@ -29,6 +30,7 @@ def create(
     scheme: str = "http",
     launch: Launch = jobs.launch,
     now: Clock = utc_now,
+    limits: Limits = DEFAULT_LIMITS,
 ) -> FastAPI:
     """The application for the runs of a root.
 
@@ -39,7 +41,7 @@ def create(
     version = metadata.version("t6gps")
     app = FastAPI(title="t6gps", version=version, docs_url=None, redoc_url=None, redirect_slashes=False)
     app.state.served = Served(root, launch)
-    app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now)
+    app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now, limits=limits)
     for routes in (reading.routes, operating.routes, administering.routes):
         app.include_router(routes)
 
@@ -62,6 +64,8 @@ def _refused(request: Request, error: Exception) -> Response:
         return refusal(HTTPStatus.UNPROCESSABLE_ENTITY, _sentence(error), ServerError)
     if isinstance(error, HTTPException):
         return refusal(error.status_code, str(error.detail), ServerError, error.headers)
+    if isinstance(error, NoSuchRunError):
+        return refusal(HTTPStatus.NOT_FOUND, str(error), RunError)
     if isinstance(error, ConfigError | QueryError):
         return refusal(HTTPStatus.BAD_REQUEST, str(error), type(error))
     if isinstance(error, T6GpsError):

@@ -1,22 +1,22 @@
-"""What stands before every route: names of the server, origins, tokens, rates, sizes, and clients that stand still.
+"""What stands before every route: names of the server, origins, tokens, rates, sizes, and bodies that do not come.
 
-A request is refused before anything of its body is read. A client that neither sends nor takes anything for STALLED_S
-is dropped, wherever it is in a stream, and holds up nobody meanwhile.
+A request is refused before anything of its body is read.
 """
 
 from __future__ import annotations
 
 import asyncio
-import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Mapping
+from dataclasses import dataclass
 from datetime import UTC, datetime
 from http import HTTPStatus
 from pathlib import Path
 from typing import final
 
 from starlette.datastructures import Headers
+from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
@@ -28,28 +28,29 @@ from t6gps.storage.errors import ServerError
 
 OPEN = ("/v1/health", "/openapi.json")
 """Paths that need no token: they say nothing of any run."""
-BODY_BYTES_N = 2**20
 SENTENCE_LENGTH_N = 10_000
-STALLED_S = 30.0
-REQUESTS_PER_S, REQUESTS_BURST_N = 200.0, 400
-FAILURES_PER_S, FAILURES_BURST_N = 1.0, 20
-_log = logging.getLogger(__name__)
 Clock = Callable[[], datetime]
+
+
+@dataclass(frozen=True)
+class Limits:
+    """Bounds on what clients may do.
+
+    body_bytes_n   of a request
+    stalled_s      without a byte of a body
+    requests       of one token: each second, and at once
+    failures       of one address without a valid token: each second, and at once
+    """
+
+    body_bytes_n: int = 2**20
+    stalled_s: float = 30.0
+    requests: tuple[float, int] = (200.0, 400)
+    failures: tuple[float, int] = (1.0, 20)
 
 
 def utc_now() -> datetime:
     """The time by which tokens expire."""
     return datetime.now(UTC)
-
-
-class _Refused(Exception):
-    def __init__(self, status: HTTPStatus, sentence: str, headers: Mapping[str, str] | None = None) -> None:
-        super().__init__(sentence)
-        self.status, self.headers = status, headers
-
-
-class _Stalled(Exception):
-    pass
 
 
 def refusal(
@@ -70,16 +71,12 @@ class Guard:
         root: Path,
         names: frozenset[str],
         scheme: str,
-        now: Clock = utc_now,
-        stalled_s: float = STALLED_S,
-        rates: tuple[Rates, Rates] | None = None,
+        now: Clock,
+        limits: Limits,
     ) -> None:
         self._app, self._root, self._names, self._scheme, self._now = app, root, names, scheme, now
-        self._stalled_s, self._verifier = stalled_s, Verifier(root)
-        self._requests, self._failures = rates or (
-            Rates(REQUESTS_PER_S, REQUESTS_BURST_N),
-            Rates(FAILURES_PER_S, FAILURES_BURST_N),
-        )
+        self._limits, self._verifier = limits, Verifier(root)
+        self._requests, self._failures = Rates(*limits.requests), Rates(*limits.failures)
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer a request, or have it answered."""
@@ -90,23 +87,21 @@ class Guard:
             self._check_names(Headers(scope=scope))
             if scope["path"] not in OPEN:
                 state["token"] = self._check_token(scope)
-            receive = _bounded(Headers(scope=scope), receive, self._stalled_s)
+            receive = _bounded(Headers(scope=scope), receive, self._limits)
             await self._app(scope, receive, self._sending(scope, send))
-        except _Refused as error:
-            await refusal(error.status, str(error), ServerError, error.headers)(scope, receive, send)
-        except _Stalled:
-            _log.info("%s has stood still for %.0f s and is dropped", _address(scope), self._stalled_s)
+        except HTTPException as error:
+            await refusal(error.status_code, str(error.detail), ServerError, error.headers)(scope, receive, send)
 
     def _check_names(self, headers: Headers) -> None:
         """Who was led here by another name, or by a page of another server, is refused."""
         host = headers.get("host", "")
         if _without_port(host) not in self._names:
             names = ", ".join(sorted(self._names))
-            raise _Refused(HTTPStatus.BAD_REQUEST, f"Host {host[:100]!r} is none of this server's names: {names}")
+            raise HTTPException(HTTPStatus.BAD_REQUEST, f"Host {host[:100]!r} is none of this server's names: {names}")
         origin = headers.get("origin")
         if origin is not None and origin != f"{self._scheme}://{host}":
             sentence = f"Origin {origin[:100]!r} may not ask here; only pages of this server may"
-            raise _Refused(HTTPStatus.FORBIDDEN, sentence)
+            raise HTTPException(HTTPStatus.FORBIDDEN, sentence)
 
     def _check_token(self, scope: Scope) -> Token:
         kind, _, text = Headers(scope=scope).get("authorization", "").partition(" ")
@@ -117,22 +112,18 @@ class Guard:
         except ServerError as error:
             _wait(self._failures.take(_address(scope), time.monotonic()))
             challenge = {"WWW-Authenticate": "Bearer"}
-            raise _Refused(HTTPStatus.UNAUTHORIZED, str(error), challenge) from None
+            raise HTTPException(HTTPStatus.UNAUTHORIZED, str(error), challenge) from None
         _wait(self._requests.take(token.id, time.monotonic()))
         return token
 
     def _sending(self, scope: Scope, send: Send) -> Send:
-        """Sends parts of an answer to who takes them, and notes the answer to a change before it is given."""
+        """Sends an answer, and notes that to a change before."""
 
         async def sending(message: Message) -> None:
             state = scope["state"]
             if message["type"] == "http.response.start" and "change" in state:
                 audit.write(self._root, self._line(scope, message["status"]))
-            try:
-                async with asyncio.timeout(self._stalled_s):
-                    await send(message)
-            except TimeoutError:
-                raise _Stalled from None
+            await send(message)
 
         return sending
 
@@ -149,11 +140,11 @@ class Guard:
         )
 
 
-def _bounded(headers: Headers, receive: Receive, stalled_s: float) -> Callable[[], Awaitable[Message]]:
-    """Receives a body of at most BODY_BYTES_N, from a client that goes on sending."""
+def _bounded(headers: Headers, receive: Receive, limits: Limits) -> Callable[[], Awaitable[Message]]:
+    """Receives a body that is not too large, from a client that goes on sending."""
     said = headers.get("content-length", "0")
-    if said.isdecimal() and int(said) > BODY_BYTES_N:
-        raise _too_large(said)
+    if said.isdecimal() and int(said) > limits.body_bytes_n:
+        raise _too_large(said, limits)
     taken_n, complete = 0, False
 
     async def receiving() -> Message:
@@ -161,28 +152,30 @@ def _bounded(headers: Headers, receive: Receive, stalled_s: float) -> Callable[[
         if complete:  # what comes now is that the client goes, whenever it likes
             return await receive()
         try:
-            async with asyncio.timeout(stalled_s):
+            async with asyncio.timeout(limits.stalled_s):
                 message = await receive()
         except TimeoutError:
-            raise _Refused(HTTPStatus.REQUEST_TIMEOUT, f"the body did not come within {stalled_s:.0f} s") from None
+            raise HTTPException(
+                HTTPStatus.REQUEST_TIMEOUT, f"the body did not come within {limits.stalled_s:.0f} s"
+            ) from None
         taken_n += len(message.get("body", b""))
-        if taken_n > BODY_BYTES_N:
-            raise _too_large(taken_n)
+        if taken_n > limits.body_bytes_n:
+            raise _too_large(taken_n, limits)
         complete = not message.get("more_body", False)
         return message
 
     return receiving
 
 
-def _too_large(size: object) -> _Refused:
-    sentence = f"the body has {size} bytes or more; at most {BODY_BYTES_N} are taken"
-    return _Refused(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, sentence)
+def _too_large(size: object, limits: Limits) -> HTTPException:
+    sentence = f"the body has {size} bytes or more; at most {limits.body_bytes_n} are taken"
+    return HTTPException(HTTPStatus.REQUEST_ENTITY_TOO_LARGE, sentence)
 
 
 def _wait(seconds: int) -> None:
     if seconds:
         sentence = f"too many requests; ask again after {seconds} s"
-        raise _Refused(HTTPStatus.TOO_MANY_REQUESTS, sentence, {"Retry-After": str(math.ceil(seconds))})
+        raise HTTPException(HTTPStatus.TOO_MANY_REQUESTS, sentence, {"Retry-After": str(math.ceil(seconds))})
 
 
 def _without_port(host: str) -> str:

@@ -18,7 +18,7 @@ from t6gps.storage.errors import ServerError
 
 CONNECTIONS_N = 512
 IDLE_S, GRACE_S = 15, 3
-BACKLOG_N = 128
+BACKLOG_N, STALLED_S = 128, 30.0
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -44,7 +44,7 @@ def serve(root: Path, address: Address, say: Callable[[str], object]) -> None:
     root, secured = catalog.whole(root), _secured(address)
     tokens.folder(root)
     known = tokens.listed(root)
-    with _listening(address) as listener:
+    with listening(address) as listener:
         scheme = "https" if secured else "http"
         allowed = _names(address)
         config = uvicorn.Config(
@@ -93,8 +93,11 @@ def _no_password() -> str:
     return ""
 
 
-def _listening(address: Address) -> socket.socket:
-    """A socket that listens there. ServerError with the remedy for its cause."""
+def listening(address: Address, stalled_s: float = STALLED_S) -> socket.socket:
+    """A socket that listens there; a client that takes nothing for `stalled_s` is dropped by the kernel.
+
+    ServerError with the remedy for its cause where it cannot.
+    """
     try:
         family, kind, protocol, _, place = socket.getaddrinfo(
             address.host, address.port, type=socket.SOCK_STREAM, flags=socket.AI_PASSIVE
@@ -104,6 +107,8 @@ def _listening(address: Address) -> socket.socket:
         raise ServerError(f"there is no address {address.host!r}: {error}; give one of this machine's") from None
     try:
         listener.setsockopt(socket.SOL_SOCKET, socket.SO_REUSEADDR, 1)
+        listener.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, round(stalled_s * 1000))  # of its clients, too
+        listener.setsockopt(socket.SOL_SOCKET, socket.SO_KEEPALIVE, 1)
         listener.bind(place)
         listener.listen(BACKLOG_N)
     except OSError as error:
