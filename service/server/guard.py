@@ -6,6 +6,7 @@ A request is refused before anything of its body is read.
 from __future__ import annotations
 
 import asyncio
+import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Mapping
@@ -23,12 +24,13 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from t6gps.service.remote.messages import AuditLine
 from t6gps.service.server import audit
 from t6gps.service.server.rates import Rates
-from t6gps.service.server.tokens import Token, Verifier
+from t6gps.service.server.tokens import RefusedTokenError, Token, Verifier
 from t6gps.storage.errors import ServerError
 
 OPEN = ("/v1/health", "/openapi.json")
 """Paths that need no token: they say nothing of any run."""
 SENTENCE_LENGTH_N = 10_000
+_log = logging.getLogger(__name__)
 Clock = Callable[[], datetime]
 
 
@@ -107,12 +109,16 @@ class Guard:
         kind, _, text = Headers(scope=scope).get("authorization", "").partition(" ")
         try:
             if kind.lower() != "bearer" or not text:
-                raise ServerError("a token is needed: set T6GPS_TOKEN, or send Authorization: Bearer TOKEN")
+                raise RefusedTokenError("a token is needed: set T6GPS_TOKEN, or send Authorization: Bearer TOKEN")
             token = self._verifier.verify(text.strip(), self._now())
-        except ServerError as error:
+        except RefusedTokenError as error:
             _wait(self._failures.take(_address(scope), time.monotonic()))
             challenge = {"WWW-Authenticate": "Bearer"}
             raise HTTPException(HTTPStatus.UNAUTHORIZED, str(error), challenge) from None
+        except ServerError as error:
+            _log.error("%s", error)
+            sentence = "the server cannot read its tokens; see its log"
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, sentence) from None
         _wait(self._requests.take(token.id, time.monotonic()))
         return token
 

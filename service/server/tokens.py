@@ -30,6 +30,10 @@ _NOBODY = hashlib.sha256(b"").hexdigest()
 _OTHERS = 0o077
 
 
+class RefusedTokenError(ServerError):
+    """A token that opens nothing."""
+
+
 class Token(TokenLine):
     """A line of the file."""
 
@@ -88,17 +92,20 @@ class Verifier:
         self._tokens: dict[str, Token] = {}
 
     def verify(self, text: str, now: datetime) -> Token:
-        """The token of that text. ServerError for a wrong, revoked or expired one; nothing tells wrong from revoked."""
+        """The token of that text. RefusedTokenError for one that is wrong, revoked or expired.
+
+        ServerError where the tokens cannot be read.
+        """
         self._refresh()
         match = _TEXT.fullmatch(text)
         identity, secret = match.groups() if match else ("", "")
         token = self._tokens.get(identity)
         known = hmac.compare_digest(token.sha256 if token else _NOBODY, _digest(secret))
         if token is None or not match or not known:
-            raise ServerError("this token is not known here; ask for another one (t6gps token create)")
+            raise RefusedTokenError("this token is not known here; ask for another one (t6gps token create)")
         if token.expires <= now:
             when = token.expires.astimezone(UTC).isoformat(timespec="seconds")
-            raise ServerError(f"token {token.name!r} expired at {when}; ask for another one (t6gps token create)")
+            raise RefusedTokenError(f"token {token.name!r} expired at {when}; ask for another one (t6gps token create)")
         return token
 
     def _refresh(self) -> None:

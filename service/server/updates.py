@@ -56,8 +56,11 @@ class Follower:
         return [_event("status", status)]
 
     def _iterations(self) -> list[str]:
-        log = self.run.tables / "episodes" / "_delta_log"  # the table that is committed last
-        stamp = log.stat().st_mtime_ns if log.is_dir() else NONE
+        try:
+            log = self.run.tables / "episodes" / "_delta_log"  # of the table that is committed last
+            stamp = log.stat().st_mtime_ns
+        except FileNotFoundError:
+            return []
         if stamp == self._stamp:
             return []
         rows = iterations(self.run, self.last + 1)

@@ -136,6 +136,15 @@ def test_a_name_has_one_token_until_it_expires(tmp_path: Path) -> None:
         tokens.revoke(tmp_path, "b")
 
 
+def test_tokens_that_cannot_be_read_open_nothing_and_the_answer_does_not_say_where_they_are(server: Server) -> None:
+    path = server.root / ".server" / "tokens.json"
+    path.write_text("{")
+    with server.http(Scope.ADMIN) as http:
+        answer = http.get("/v1/runs")
+    assert answer.status_code == 503
+    assert str(path) not in answer.text
+
+
 @pytest.mark.parametrize("host", ["evil.example", "", "127.0.0.1.evil.example", "[::2]:80"])
 def test_another_name_than_the_servers_is_refused(server: Server, host: str) -> None:
     with server.http(Scope.READ) as http:
