@@ -13,6 +13,8 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 
 STOPS = (signal.SIGINT, signal.SIGTERM)
+STARTING = "t6gps starts Ray"
+"""Name of the thread that does, and stays until Ray is left (`ray_backend.starting`)."""
 
 
 @contextmanager

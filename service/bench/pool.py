@@ -2,12 +2,12 @@
 
 from __future__ import annotations
 
-import os
 import signal
 from dataclasses import dataclass
 
 import numpy as np
 
+from t6gps.service import checks
 from t6gps.service.bench import large_pool, latency, rounds
 from t6gps.service.bench.contenders import PRESET, Job, pipes, raw, rough_job, service
 from t6gps.service.bench.rounds import Contender, Say
@@ -63,7 +63,7 @@ def pool(say: Say, seconds: float = SECONDS, rounds: int = ROUNDS) -> dict[str, 
 
 def check_local() -> None:
     """ConfigError when RAY_ADDRESS names a cluster."""
-    if "RAY_ADDRESS" in os.environ:
+    if checks.cluster_address() is not None:
         raise ConfigError("bench pool measures this machine, found RAY_ADDRESS set; unset it")
 
 

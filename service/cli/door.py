@@ -6,9 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Protocol, final
-
-import pyarrow as pa
+from typing import BinaryIO, Protocol, final
 
 from t6gps.service.pool import control
 from t6gps.service.pool.control import Status
@@ -16,7 +14,8 @@ from t6gps.service.training import summary
 from t6gps.service.training.summary import RunSummary
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
-from t6gps.storage.sql import query as sql
+from t6gps.storage.sql import query
+from t6gps.storage.sql.query import Head
 
 
 class Door(Protocol):
@@ -28,7 +27,9 @@ class Door(Protocol):
 
     def scale(self, name: str, workers: int, deadline_s: float) -> Status: ...
 
-    def query(self, name: str, sql: str) -> pa.Table: ...
+    def head(self, name: str, sql: str) -> Head: ...
+
+    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None: ...
 
 
 @final
@@ -54,9 +55,13 @@ class Local:
         """Give a running run so many workers; its status then."""
         return control.scale(catalog.open_run(self.root, name), workers, deadline_s)
 
-    def query(self, name: str, sql_text: str) -> pa.Table:
-        """The result of one SELECT."""
-        return sql.query(catalog.open_run(self.root, name), sql_text)
+    def head(self, name: str, sql: str) -> Head:
+        """The first rows of the result of one SELECT."""
+        return query.head(catalog.open_run(self.root, name), sql)
+
+    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
+        """Write the result of one SELECT as arrow, csv or json."""
+        query.write(catalog.open_run(self.root, name), sql, form, sink)
 
 
 @contextmanager

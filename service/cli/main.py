@@ -16,9 +16,10 @@ from typing import Annotated, NoReturn
 
 import typer
 
+from t6gps.service import advice
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import live, serving, stored
+from t6gps.service.cli import doctor, live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -47,13 +48,16 @@ EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; `t6gps.__main__` has prepared the process, whose arguments are taken where none are given."""
     try:
-        app(arguments)
+        try:
+            app(arguments)
+        finally:
+            sys.stdout.flush()  # a full disk is told of below
     except T6GpsError as error:
         message = str(error)
     except OSError as error:
-        message = (
-            f"{error.filename or 'the system'}: {error.strerror or error}; make room or give access, then try again"
-        )
+        message = advice.sentence(error)
+    except KeyboardInterrupt:  # before or after the command itself
+        sys.exit(EXIT_INTERRUPTED)
     else:
         return
     terminal.say(f"error: {message}", style="red")
@@ -78,6 +82,9 @@ def train(
         with terminal.ProgressDisplay(config.run.iterations) as display:
             result = session.complete(config, run, serial, display)
     except KeyboardInterrupt:
+        if not run.path.exists():
+            terminal.say("stopped before anything was sampled; nothing is left of the run")
+            raise typer.Exit(EXIT_INTERRUPTED) from None
         _exit_interrupted(_train_command(run, source, root, overrides))
     from t6gps.service.views import run_figures
 
@@ -170,6 +177,7 @@ def bench(
 stored.add_to(app)
 live.add_to(app)
 serving.add_to(app)
+doctor.add_to(app)
 
 
 def _exit_interrupted(command: list[str]) -> NoReturn:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import shlex
+import sys
 from collections.abc import Sequence
 from dataclasses import asdict
 from enum import StrEnum
@@ -92,9 +93,11 @@ def query(
     form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
 ) -> None:
     """Query a run's stored trajectories with SQL."""
-    with door.opened(root, server) as runs:
-        table = runs.query(run_name, sql)
-    terminal.write_table(table, form.value)
+    with door.opened(root, server) as there:
+        if form is QueryFormat.TABLE:
+            terminal.print_head(there.head(run_name, sql))
+        else:
+            there.write(run_name, sql, form.value, sys.stdout.buffer)
 
 
 def render(

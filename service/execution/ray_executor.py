@@ -51,7 +51,7 @@ class RayExecutor(Executor):
         super().__init__(config, run)
         self._learner: RayLearner | None = None
         self._keep_ahead: Keep | None = None
-        self._closed = False
+        self._closed, self._timings = False, timings
         state = PoolState(
             config.run.workers,
             settings_digest(config.rollout.model_dump_json()),
@@ -72,7 +72,7 @@ class RayExecutor(Executor):
     @property
     def learner(self) -> RayLearner:
         if self._learner is None:
-            self._learner = RayLearner(self.config, cluster.this_node(), self._until_done)
+            self._learner = RayLearner(self.config, cluster.this_node(), self._timings, self._until_done)
         return self._learner
 
     def sample(
@@ -93,6 +93,8 @@ class RayExecutor(Executor):
         self._keep_ahead = None
         quarantined = self._open(plans, snapshot, purpose)
         self.transport.policies.publish(snapshot)
+        while not self.transport.policies.has_the_newest(control.TICK_S):
+            self.tend()
         self.pool.open(plans, quarantined, {snapshot.version: policy_digest(snapshot)})
 
     def feed(self, episode: Episode) -> None:
@@ -123,9 +125,12 @@ class RayExecutor(Executor):
     def _until_done(self, reference: Reference) -> None:
         """Wait for the learner, and tend the pool meanwhile."""
         self.pool.wait("the run", "the learner", True)
-        while not ray.wait([reference], timeout=control.TICK_S)[0]:
-            self.tend()
-        self.pool.wait("the run", "the learner", False)
+        try:
+            while not ray.wait([reference], timeout=control.TICK_S)[0]:
+                self.tend()
+                self.learner.check_life()
+        finally:
+            self.pool.wait("the run", "the learner", False)
         self.tend()
 
     def tend(self) -> None:

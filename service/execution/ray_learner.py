@@ -10,6 +10,7 @@ import math
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from concurrent.futures import Future
 from functools import cache
 from pathlib import Path
 from typing import Any, TypeVar
@@ -22,7 +23,10 @@ from t6gps.learner.rows import AnyArray
 from t6gps.service import threads
 from t6gps.service.config import Config
 from t6gps.service.pool import control
+from t6gps.service.pool.deadlines import Timings
+from t6gps.service.ray_backend import processes, pulse
 from t6gps.service.ray_backend.cluster import Reference, start_actor
+from t6gps.service.ray_backend.pulse import Pulse, Watch
 from t6gps.service.ray_backend.worker_actor import Answer
 from t6gps.storage import ipc, spool
 from t6gps.storage.catalog import Run
@@ -41,10 +45,15 @@ class LearnerActor:
     """The learner in a process of its own."""
 
     def __init__(self, config: Config) -> None:
+        self._pulse = pulse.start()
         from t6gps.service.execution.wiring import new_learner  # it loads torch, which the supervisor does without
 
         threads.limit()
         self._learner = new_learner(config, fit_map=_task_map(config.run.workers))
+
+    def pulse(self) -> Pulse:
+        """Where its signs of life are."""
+        return self._pulse
 
     def add(self, *answers: Answer) -> None:
         """Take episodes that lie in the object store."""
@@ -85,14 +94,17 @@ class LearnerActor:
 
 
 class RayLearner:
-    """The learner's actor, as a `LearnerPort`; every call raises LearnerDiedError when its process is gone.
+    """The learner's actor, as a `LearnerPort`; every call raises LearnerDiedError when its process is gone or hangs.
 
-    until_done   waits for a reference to be there, and tends the pool meanwhile
+    until_done   waits for a reference to be there, tends the pool, and calls `check_life` meanwhile
     """
 
-    def __init__(self, config: Config, node: str, until_done: Callable[[Reference], None]) -> None:
+    def __init__(self, config: Config, node: str, timings: Timings, until_done: Callable[[Reference], None]) -> None:
         self.actor = start_actor(LearnerActor, config, where=node)
-        self._until_done = until_done
+        self._until_done, self._timings = until_done, timings
+        self._started_s = time.monotonic()
+        self._asked: Future[Pulse] = self.actor.pulse.remote().future()
+        self._watch: Watch | None = None
         self._next: list[Reference] = []
         self._taken: list[Reference] = []
 
@@ -150,9 +162,26 @@ class RayLearner:
     def recall(self, run: Run) -> None:
         self._answer(self.actor.recall.remote(Run(run.path.absolute())))  # the actor is in another folder
 
+    def check_life(self) -> None:
+        """LearnerDiedError, and its process is ended, when it has given no sign of life for too long."""
+        if self._asked.done() and self._asked.exception() is not None:
+            return  # it has died, and whoever waits for it hears of that
+        if self._watch is None and self._asked.done():
+            self._watch = Watch(self._asked.result())
+        if self._watch is None:
+            silent_s, allowed_s = time.monotonic() - self._started_s, self._timings.start_s
+        else:
+            silent_s, allowed_s = self._watch.silent_s(), self._timings.learner_silent_s
+        if silent_s > allowed_s:
+            stacks = "it was never ready" if self._watch is None else processes.stacks(self._watch.pulse.process)
+            self.kill()
+            raise LearnerDiedError(f"the learner gave no sign of life for {silent_s:.0f} s and was ended; {stacks}")
+
     def kill(self) -> None:
         """End its process at once."""
         ray.kill(self.actor)
+        if self._watch is not None:
+            processes.kill(self._watch.pulse.process)  # a stopped process does not hear Ray
 
     def _answer(self, reference: Reference) -> Any:
         self._until_done(reference)

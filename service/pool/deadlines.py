@@ -35,6 +35,8 @@ class Timings:
     """For the policy server's answer. An episode has more time than that: a worker that asks is not to blame."""
     policy_start_s: float = 60.0
     """For the first answer of a policy server, whose process has to start."""
+    learner_silent_s: float = 120.0
+    """For the learner's sign of life, which it gives every second whatever it computes."""
     examine_s: float = 0.6
     """For another node to say what is left of a worker; it is cut off, and its node with it, when it does not."""
 

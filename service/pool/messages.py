@@ -42,30 +42,33 @@ class Alive:
 
 @dataclass(frozen=True)
 class Sampled:
-    """An episode came back."""
+    """An episode came back, at that time."""
 
     worker: WorkerId
     plan: EpisodePlan
     nbytes: int
     policy_digest: str
+    at_s: float
 
 
 @dataclass(frozen=True)
 class Failed:
-    """An attempt at an episode failed in the worker."""
+    """An attempt at an episode failed in the worker, at that time."""
 
     worker: WorkerId
     plan: EpisodePlan
     failure: Failure
     policy_digest: str
+    at_s: float
 
 
 @dataclass(frozen=True)
 class Unserved:
-    """A worker could not get the policy that a plan names."""
+    """A worker could not get the policy that a plan names, at that time."""
 
     worker: WorkerId
     plan: EpisodePlan
+    at_s: float
 
 
 @dataclass(frozen=True)
@@ -119,7 +122,14 @@ class ScaleRequested:
     workers: int
 
 
-Observation = Opened | Ready | Alive | Sampled | Failed | Unserved | Died | Ended | Durable | Capacity | ScaleRequested
+@dataclass(frozen=True)
+class Paused:
+    """The supervisor itself has not looked for a while."""
+
+
+Observation = (
+    Opened | Ready | Alive | Sampled | Failed | Unserved | Died | Ended | Durable | Capacity | ScaleRequested | Paused
+)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
@@ -16,6 +17,9 @@ from t6gps.service.pool.supervisor import decide
 from t6gps.service.pool.transport import Done, Transport
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan
+
+PAUSE_S = 2.0
+"""A pool looks ten times a second. One that did not for so long stood still, with its process or its machine."""
 
 
 class Pool:
@@ -50,7 +54,9 @@ class Pool:
         RunError when the run cannot continue (`supervisor.decide`).
         """
         self._listen(0.0)
-        self.ticked_s = self._clock()
+        before_s, self.ticked_s = self.ticked_s, self._clock()
+        if PAUSE_S < self.ticked_s - before_s < math.inf:
+            self._unseen.append(messages.Paused())
         workers = self._control.scale_request()
         if workers is not None:
             self._unseen.append(messages.ScaleRequested(workers))
@@ -110,17 +116,17 @@ class Pool:
     def _listen(self, wait_s: float) -> None:
         """Take what the transport reports; episodes stay here, the supervisor sees their size."""
         for report in self._transport.poll(wait_s):
-            if not isinstance(report, Done):
-                self._unseen.append(report)
-            elif report.result is None:
-                self._unseen.append(messages.Unserved(report.worker, report.plan))
-            elif isinstance(report.result, Failure):
-                self._unseen.append(messages.Failed(report.worker, report.plan, report.result, report.policy_digest))
-            else:
-                self._came[report.worker, report.plan.episode_id] = report.result
-                self._unseen.append(
-                    messages.Sampled(report.worker, report.plan, report.result.nbytes, report.policy_digest)
-                )
+            self._unseen.append(self._taken(report) if isinstance(report, Done) else report)
+
+    def _taken(self, done: Done) -> Observation:
+        """What the supervisor sees of an attempt that is over."""
+        worker, plan, result, digest, at_s = done.worker, done.plan, done.result, done.policy_digest, done.at_s
+        if result is None:
+            return messages.Unserved(worker, plan, at_s)
+        if isinstance(result, Failure):
+            return messages.Failed(worker, plan, result, digest, at_s)
+        self._came[worker, plan.episode_id] = result
+        return messages.Sampled(worker, plan, result.nbytes, digest, at_s)
 
     def _decide(self) -> None:
         """Decide and carry out, until nothing new follows from it."""

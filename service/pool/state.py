@@ -174,6 +174,7 @@ class PoolState:
     last_trouble       the newest failure, in words
     free_n, asked_s    room for more workers, and when the cluster was asked
     needed_s           when autoscaling last needed as many workers as there are
+    judges_from_s      when deadlines count again
     """
 
     wanted: int
@@ -194,6 +195,7 @@ class PoolState:
     free_n: int = 0
     asked_s: float | None = None
     needed_s: float | None = None
+    judges_from_s: float | None = None
     counters: dict[str, int] = field(
         default_factory=lambda: {"started": 0, Ending.CRASH: 0, Ending.HANG: 0, Ending.DRAINED: 0}
     )

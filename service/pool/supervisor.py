@@ -20,6 +20,8 @@ from t6gps.storage.records import EpisodePlan
 
 BREAKER_N = 5
 """Starts in a row that fail, with no worker left, until the breaker opens."""
+GRACE_S = 1.0
+"""After a pause of the supervisor itself, what workers did meanwhile is still on its way: nobody is late yet."""
 
 
 def decide(state: PoolState, observed: Sequence[Observation], now: float) -> list[Instruction]:
@@ -52,6 +54,8 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
             state.free_n = observation.free_n
             for each in state.workers.values():
                 each.placed = each.id not in observation.waiting
+        case messages.Paused():
+            state.judges_from_s = now + GRACE_S
         case messages.ScaleRequested():
             state.wanted, state.autoscale = observation.workers, None  # scaled by hand: it stays so
         case messages.Ended():
@@ -77,40 +81,40 @@ def _on_report(state: PoolState, worker: Worker, report: Observation, now: float
         case messages.Died():
             yield _end(state, worker, now, Ending.CRASH, report.error, report.message)
         case messages.Unserved():
-            _on_result(state, worker, report.plan, now)
+            _on_result(state, worker, report.plan, report.at_s)
             state.ledger.give_back(*worker.id)
             worker.plans.clear()
-            _begin_episode(state, worker, now)
+            _begin_episode(state, worker, report.at_s)
         case messages.Failed() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
-            _on_result(state, worker, report.plan, now)
+            _on_result(state, worker, report.plan, report.at_s)
             yield from _record_failure(state, report.plan, report.failure)
         case messages.Sampled() if _acted_as_planned(state, worker, report.plan, report.policy_digest):
-            state.times.add(_on_result(state, worker, report.plan, now), report.plan.steps)
+            state.times.add(_on_result(state, worker, report.plan, report.at_s), report.plan.steps)
             state.slots[worker.id.slot].failures_n = 0
             state.largest_bytes = max(state.largest_bytes, report.nbytes)
             if state.ledger.arrive(report.plan):
                 yield messages.Accept(worker.id, report.plan.episode_id)
 
 
-def _on_result(state: PoolState, worker: Worker, plan: EpisodePlan, now: float) -> float:
-    """A worker is done with a plan and comes to the next; how long it took (s)."""
-    took_s = now - worker.since_s
+def _on_result(state: PoolState, worker: Worker, plan: EpisodePlan, at_s: float) -> float:
+    """A worker was done with a plan then and came to the next; how long it took (s)."""
+    took_s = at_s - worker.since_s
     if plan in worker.plans:
         worker.plans.remove(plan)
-    _begin_episode(state, worker, now)
+    _begin_episode(state, worker, at_s)
     return took_s
 
 
-def _begin_episode(state: PoolState, worker: Worker, now: float) -> None:
-    """The worker comes to the first of its plans, if it has one."""
-    worker.since_s, worker.answered, worker.deadline_s = now, True, None
+def _begin_episode(state: PoolState, worker: Worker, at_s: float) -> None:
+    """The worker comes to the first of its plans then, if it has one."""
+    worker.since_s, worker.answered, worker.deadline_s = at_s, True, None
     if not worker.plans:
         worker.enter(WorkerPhase.IDLE)
         return
     if worker.phase is WorkerPhase.IDLE:
         worker.enter(WorkerPhase.SAMPLING)
     plan = worker.plans[0]
-    worker.deadline_s = now + state.times.deadline_s(plan.steps) * 2 ** state.ledger.hangs_n(plan)
+    worker.deadline_s = at_s + state.times.deadline_s(plan.steps) * 2 ** state.ledger.hangs_n(plan)
 
 
 def _acted_as_planned(state: PoolState, worker: Worker, plan: EpisodePlan, policy_digest: str) -> bool:
@@ -160,6 +164,8 @@ def _on_ended(state: PoolState, worker_id: WorkerId, post_mortem: messages.PostM
 def _end_overdue(state: PoolState, now: float) -> Iterator[Instruction]:
     """Workers that hang by their deadline, and the question for a sign of life to those that are idle."""
     timings = state.timings
+    if state.judges_from_s is not None and now < state.judges_from_s:
+        return
     for worker in state.workers.values():
         for_s, pinged_s = now - worker.since_s, max(worker.pinged_s or worker.since_s, worker.since_s)
         silent_s = now - pinged_s

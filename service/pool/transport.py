@@ -13,11 +13,15 @@ from t6gps.storage.records import Episode, EpisodePlan
 
 @dataclass(frozen=True)
 class Done:
-    """An attempt is over: an episode, a failure, or None when the worker could not get the policy that it needs."""
+    """An attempt is over: an episode, a failure, or None when the worker could not get the policy that it needs.
+
+    at_s   when it came back (s, the pool's clock)
+    """
 
     worker: WorkerId
     plan: EpisodePlan
     result: Episode | Failure | None
+    at_s: float
     policy_digest: str = ""
 
 

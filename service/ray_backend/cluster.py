@@ -6,26 +6,33 @@ lost with that node alone. Workers are spread over all nodes.
 
 from __future__ import annotations
 
-import logging
 import math
 import os
 import secrets
-import socket
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from typing import Any, TypeAlias
 
 import ray
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
-from t6gps.service import caller
+from t6gps.service import caller, checks, machine
+from t6gps.service.checks import Wanted
 from t6gps.service.config import WORKERS_MOST_N, Config
-from t6gps.service.ray_backend import private
+from t6gps.service.ray_backend import private, starting
 from t6gps.storage.errors import RunError
 
-OBJECT_STORE_BYTES = 2 * 1024**3
-CONNECT_DEADLINE_S = 10.0
-"""How long the head of a cluster has to answer."""
+STARTING = "Ray could not be started on this machine", "end other programs if it is busy, or ask t6gps doctor"
+JOINING = (
+    "the cluster at RAY_ADDRESS={} could not be joined",
+    "see that a head of Ray listens there, and is not busy",
+)
+REMEDIES = {
+    "ersion mismatch": "install the same versions of Ray and Python on every machine",
+    "Could not find any running Ray": "start its head (ray start --head), or unset RAY_ADDRESS",
+    "uthenticat": "give its token (RAY_AUTH_MODE=token and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH)",
+}
+"""By words of the error or of its causes: Ray has no types for them."""
 SPREAD = "SPREAD"
 Actor: TypeAlias = Any
 """A handle to an actor: Ray makes the methods of it."""
@@ -48,7 +55,8 @@ def embedded_environment() -> dict[str, str]:
         # Processes that fit models wait for the next iteration. Ray would end them after a second, and a new one takes
         # longer to start than the fits take.
         "RAY_idle_worker_killing_time_threshold_ms": "300000",
-    } | {name: value for name, value in os.environ.items() if name.startswith("RAY_")}
+        "PYTHONOPTIMIZE": "",  # Ray's own processes need their docstrings
+    } | {name: value for name, value in os.environ.items() if name.startswith("RAY_") and name != "RAY_ADDRESS"}
 
 
 @contextmanager
@@ -63,34 +71,40 @@ def connection(config: Config) -> Iterator[int]:
     if ray.is_initialized():
         yield WORKERS_MOST_N
         return
-    with private.adapted():
+    with private.adapted(), machine.all_descriptors(), ExitStack() as connected:
         try:
             with caller.untouched():
-                most = _join_or_start(config)
-            yield most
-        finally:
-            with caller.untouched():
-                ray.shutdown()
-            private.read_authentication()
+                most = _join_or_start(config, connected)
+        except RunError:
+            private.read_authentication()  # of the caller's environment
+            raise
+        yield most
 
 
-def _join_or_start(config: Config) -> int:
-    if "RAY_ADDRESS" in os.environ:
-        _join(os.environ["RAY_ADDRESS"])
-        return WORKERS_MOST_N  # nodes may join later
-    os.environ.update(embedded_environment())
+def _join_or_start(config: Config, connected: ExitStack) -> int:
     each = config.run.cpus_per_worker
     workers_n = max(config.run.workers, *(config.run.autoscale or (0,)))
+    address = checks.cluster_address()
+    if address is not None:
+        checks.require(checks.CLUSTER, Wanted(workers_n))
+        _enter(connected, JOINING[0].format(address), JOINING[1], {})
+        return WORKERS_MOST_N  # nodes may join later
+    checks.require(checks.OWN_RAY, Wanted(workers_n))
+    folder = machine.temporary_folder()
+    assert folder is not None, "the checks have found one"
+    store = machine.object_store(folder)
+    os.environ.update(embedded_environment())
     cpus_n = max(math.ceil(workers_n * each), os.cpu_count() or 1)
-    _init(
-        "Ray could not be started on this machine",
-        "try again when the machine is less busy, or use --serial",
-        address="local",
-        num_cpus=cpus_n,
-        include_dashboard=False,
-        object_store_memory=OBJECT_STORE_BYTES,
-        _node_ip_address="127.0.0.1",
-    )
+    options = {
+        "address": "local",
+        "num_cpus": cpus_n,
+        "include_dashboard": False,
+        "object_store_memory": store.nbytes,
+        "_plasma_directory": str(store.folder),
+        "_temp_dir": str(folder),
+        "_node_ip_address": "127.0.0.1",
+    }
+    _enter(connected, *STARTING, options)
     return int(cpus_n / each + 1e-6)
 
 
@@ -114,29 +128,11 @@ def free_workers(cpus_per_worker: float) -> int:
     return sum(int(free / cpus_per_worker + 1e-6) for free in private.free_cpus_by_node())
 
 
-def _join(address: str) -> None:
-    """Join a cluster. RunError at once when nobody listens there, where Ray would try for minutes."""
-    if address != "auto":
-        host, colon, port = address.rpartition(":")
-        if not (colon and host and port.isdecimal()) or "://" in address:
-            raise RunError(f"RAY_ADDRESS must be HOST:PORT of a cluster's head, or auto, found {address!r}; correct it")
-        try:
-            socket.create_connection((host.strip("[]"), int(port)), CONNECT_DEADLINE_S).close()
-        except (OSError, OverflowError) as error:
-            raise RunError(
-                f"no Ray answers at RAY_ADDRESS={address} ({error}); start its head (ray start --head), correct the "
-                "address, or unset it to use this machine alone"
-            ) from None
-    _init(
-        f"the cluster at RAY_ADDRESS={address} could not be joined",
-        "give its token (RAY_AUTH_MODE=token and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH) and the same version of Ray",
-    )
-
-
-def _init(trouble: str, remedy: str, **options: Any) -> None:
-    """Start or join Ray. RunError when that fails."""
-    private.read_authentication()
+def _enter(connected: ExitStack, trouble: str, remedy: str, options: dict[str, Any]) -> None:
+    """Start or join Ray until the end of `connected`. RunError when that fails, with a known remedy or this one."""
     try:
-        ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+        connected.enter_context(starting.started(options | {"job_config": private.without_working_folder()}))
     except Exception as error:  # Ray has no narrower one for this
-        raise RunError(f"{trouble}: {' '.join(str(error).split())}; {remedy}") from error
+        causes = f"{error} {error.__cause__}"
+        known = next((helps for words, helps in REMEDIES.items() if words in causes), remedy)
+        raise RunError(f"{trouble}: {' '.join(str(error).split())}; {known}") from error

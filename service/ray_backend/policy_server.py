@@ -2,20 +2,23 @@
 
 Policies are pulled, never pushed: a worker asks when a plan names a newer version than it has. Whoever asks has a
 deadline, shorter than an episode's, so that a server that stalls is missed before a worker is taken for hung.
+
+The supervisor never waits here: it asks whether the server has the newest policy, and looks after the pool meanwhile.
 """
 
 from __future__ import annotations
 
 import logging
 import time
-from concurrent.futures import Future
+from concurrent.futures import Future, wait
 from typing import NamedTuple
 
 import ray
 
 from t6gps.service.pool.deadlines import Timings
-from t6gps.service.ray_backend import processes
+from t6gps.service.ray_backend import private, processes
 from t6gps.service.ray_backend.cluster import Actor, start_actor
+from t6gps.service.ray_backend.deaths import Deaths
 from t6gps.service.ray_backend.processes import Process
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
@@ -68,6 +71,7 @@ class PolicyServer:
         self._node, self._timings = node, timings
         self._held: dict[int, PolicySnapshot] = {}
         self._started_n = 0
+        self._deaths, self._logs = Deaths("the policy server"), private.logs_folder()
         self._start()
 
     def _start(self) -> None:
@@ -79,11 +83,12 @@ class PolicyServer:
         self._ask_for_life()
 
     def _ask_for_life(self) -> None:
+        """The answer comes after the server has taken every policy that it was given before."""
         self._pong: Future[Process] = self.source.actor.ping.remote().future()
         self._pinged_s = time.monotonic()
 
     def publish(self, snapshot: PolicySnapshot) -> None:
-        """Give the server the newest policy, and keep a copy in case the server dies.
+        """Give the server the newest policy, and keep a copy in case the server dies; see `has_the_newest`.
 
         Nothing is done for a policy that is held. RunError for one that is older than those.
         """
@@ -93,19 +98,22 @@ class PolicyServer:
         if snapshot.version < latest:
             raise RunError(f"policy versions only grow: version {latest} is published, found {snapshot.version}")
         self._held = newest(self._held | {snapshot.version: snapshot})
-        try:
-            ray.get(self.source.actor.hold.remote(snapshot), timeout=self._patience_s)
-        except ray.exceptions.RayError as error:
-            self._replace(f"does not take a policy ({type(error).__name__})")
+        self.source.actor.hold.remote(snapshot)
+        self._ask_for_life()
+
+    def has_the_newest(self, wait_s: float) -> bool:
+        """True when the server has every policy that was published; waits up to `wait_s` for that."""
+        wait([self._pong], wait_s)
+        return self._pong.done() and self._pong.exception() is None
 
     def watch(self) -> None:
-        """Replace a server that has died or gives no sign of life."""
+        """Replace a server that has died or gives no sign of life. RunError when that does not help."""
         silent_s = time.monotonic() - self._pinged_s
         if not self._pong.done():
             if silent_s > self._patience_s:
                 self._replace("does not answer")
-        elif self._pong.exception() is not None:
-            self._replace("has died")
+        elif (error := self._pong.exception()) is not None:
+            self._replace(f"has died: {' '.join(str(error).split())}")
         else:
             self.process = self._pong.result()
             if silent_s > self._timings.ping_s:
@@ -122,6 +130,9 @@ class PolicyServer:
         return self._timings.policy_start_s if self.process is None else self._timings.policy_answer_s
 
     def _replace(self, why: str) -> None:
+        log = "" if self.process is None else processes.log_tail(self._logs, self.process.pid)
+        last_words = log.strip().rpartition("\n")[2]
+        self._deaths.add(f"it {why}" + (f" ({last_words})" if last_words else ""))
         _log.warning("the policy server %s; another one takes its place", why)
         ray.kill(self.source.actor)
         if self.process is not None:

@@ -9,6 +9,7 @@ import faulthandler
 import os
 import signal
 import time
+from collections.abc import Iterable
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
@@ -64,6 +65,13 @@ def kill(process: Process) -> None:
     with suppress(ProcessLookupError):
         if _state(process):
             os.kill(process.pid, signal.SIGKILL)
+
+
+def end(pids: Iterable[int]) -> None:
+    """End processes of this machine at once; those that have ended already are left alone."""
+    for pid in pids:
+        with suppress(ProcessLookupError):
+            os.kill(pid, signal.SIGKILL)
 
 
 def log_tail(folder: Path, pid: int) -> str:

@@ -9,6 +9,7 @@ from __future__ import annotations
 import logging
 import math
 import time
+from collections import Counter
 from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from queue import Empty, SimpleQueue
@@ -33,6 +34,8 @@ from t6gps.workers.settings import RolloutSettings
 
 SILENT_NODE_S = 5.0
 """A node whose agent did not answer is not asked again for so long: its workers are lost together."""
+AGENT_DEATHS_N = 5
+"""A node whose agent has died so often gets no other: its workers are lost when something goes wrong there."""
 _log = logging.getLogger(__name__)
 
 
@@ -79,9 +82,10 @@ class RayTransport(Transport):
         self._timings = timings
         self._node, self._logs = cluster.this_node(), private.logs_folder()
         self._agents: dict[str, Actor] = {}
+        self._agent_deaths: Counter[str] = Counter()
         self._silent_s: dict[str, float] = {}
         self._remotes: dict[WorkerId, Remote] = {}
-        self._over: SimpleQueue[tuple[Call, Future[Any]]] = SimpleQueue()
+        self._over: SimpleQueue[tuple[Call, Future[Any], float]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
         self._followed = self.policies.source.number
 
@@ -108,7 +112,7 @@ class RayTransport(Transport):
                 remote.actor.follow.remote(self.policies.source)
 
     def _await(self, call: Call) -> None:
-        call.reference.future().add_done_callback(lambda future: self._over.put((call, future)))
+        call.reference.future().add_done_callback(lambda future: self._over.put((call, future, time.monotonic())))
 
     def poll(self, wait_s: float) -> list[Report]:
         self.policies.watch()
@@ -119,9 +123,9 @@ class RayTransport(Transport):
             while True:
                 over.append(self._over.get_nowait())
         except Empty:
-            return [self._report(call, future) for call, future in over if call.worker in self._remotes]
+            return [self._report(*each) for each in over if each[0].worker in self._remotes]
 
-    def _report(self, call: Call, future: Future[Any]) -> Report:
+    def _report(self, call: Call, future: Future[Any], at_s: float) -> Report:
         worker, remote = call.worker, self._remotes[call.worker]
         try:
             result = future.result()
@@ -134,18 +138,19 @@ class RayTransport(Transport):
             remote.died, remote.exited = True, memory or ("exit code" in how and "SIGTERM" not in how)
             return Died(worker, type(error).__name__, how)
         if isinstance(result, Answer):
-            return self._done(call, result)
+            return self._done(call, result, at_s)
         if isinstance(result, Started):
             return self._ready(worker, remote, result)
         return Alive(worker)
 
     def _ready(self, worker: WorkerId, remote: Remote, started: Started) -> Ready:
         remote.process, remote.node = started.process, started.identity.node_id
-        if remote.node != self._node and remote.node not in self._agents:
+        lasting = self._agent_deaths[remote.node] < AGENT_DEATHS_N
+        if remote.node != self._node and remote.node not in self._agents and lasting:
             self._agents[remote.node] = start_actor(NodeAgentActor, where=remote.node)
         return Ready(worker, started.identity)
 
-    def _done(self, call: Call, answer: Answer) -> Done:
+    def _done(self, call: Call, answer: Answer, at_s: float) -> Done:
         assert call.plan is not None, "only plans have answers"
         result: Episode | Failure | None = answer.failure
         if answer.packed is not None:
@@ -154,7 +159,7 @@ class RayTransport(Transport):
         elif answer.silent_server is not None:
             self.policies.missed(answer.silent_server)
             self._follow()
-        return Done(call.worker, call.plan, result, answer.policy_digest)
+        return Done(call.worker, call.plan, result, at_s, answer.policy_digest)
 
     def examine(self, worker: WorkerId) -> PostMortem:
         remote = self._remotes[worker]
@@ -175,6 +180,7 @@ class RayTransport(Transport):
                 return post_mortem
             except ray.exceptions.ActorDiedError:
                 del self._agents[node]  # the next worker that is ready there brings another
+                self._agent_deaths[node] += 1
             except ray.exceptions.RayError as error:
                 self._silent_s[node] = time.monotonic()
                 _log.info("the agent of node %s does not answer: %s", node, type(error).__name__)

@@ -9,7 +9,7 @@ import io
 import os
 from collections.abc import Iterator, Mapping
 from types import TracebackType
-from typing import final
+from typing import BinaryIO, final
 from urllib.parse import quote
 
 import httpx
@@ -24,6 +24,7 @@ from t6gps.service.remote.messages import (
     AuditLine,
     Health,
     IssuedToken,
+    QueryForm,
     QueryRequest,
     ScaleRequest,
     Scope,
@@ -37,6 +38,7 @@ from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
 from t6gps.storage import catalog
 from t6gps.storage.records import PolicySnapshot
+from t6gps.storage.sql.query import Head
 
 TOKEN_VARIABLE = "T6GPS_TOKEN"
 
@@ -128,11 +130,22 @@ class Client:
 
     def query(self, name: str, sql: str) -> pa.Table:
         """The result of one SELECT."""
-        content = self._server.ask("POST", f"{_run(name)}/query", checked(QueryRequest, sql=sql))
+        sink = io.BytesIO()
+        self.write(name, sql, QueryForm.ARROW, sink)
         try:
-            return pa.ipc.open_stream(content).read_all()
+            return pa.ipc.open_stream(sink.getbuffer()).read_all()
         except pa.ArrowException as error:
             raise self._server.nonsense(error) from None
+
+    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
+        """Write the result of one SELECT as arrow (an IPC stream), csv or json."""
+        for chunk in self._server.chunks(f"{_run(name)}/query", checked(QueryRequest, sql=sql, form=form)):
+            sink.write(chunk)
+        sink.flush()
+
+    def head(self, name: str, sql: str) -> Head:
+        """The first rows of the result of one SELECT, as texts for people."""
+        return self._server.post(f"{_run(name)}/query", Head, checked(QueryRequest, sql=sql, form=QueryForm.HEAD))
 
     def events(self, name: str, last: int = -1) -> Iterator[Update]:
         """What happens to a run after the iteration `last`, until the connection ends. ServerError then."""

@@ -8,10 +8,11 @@ from __future__ import annotations
 
 import ipaddress
 from collections.abc import Iterator
+from contextlib import contextmanager
 from typing import TypeVar, final
 
 import httpx
-from pydantic import BaseModel, TypeAdapter, ValidationError
+from pydantic import BaseModel, JsonValue, TypeAdapter, ValidationError
 
 from t6gps.service.remote.messages import WAIT_S, Refusal
 from t6gps.service.remote.stream import Update, parsed
@@ -74,14 +75,26 @@ class Connection:
         self._check(answer)
         return answer.content
 
+    def chunks(self, path: str, request: BaseModel) -> Iterator[bytes]:
+        """The body of an answer to a request, as it comes."""
+        with self._streamed("POST", path, json=request.model_dump(mode="json")) as answer:
+            yield from answer.iter_bytes()
+
     def events(self, path: str, last: int) -> Iterator[Update]:
         """Events of a stream after `last`, until the server ends it. ServerError where the connection breaks."""
+        with self._streamed("GET", path, headers={"Last-Event-ID": str(last)}) as answer:
+            yield from parsed(answer.iter_lines())
+
+    @contextmanager
+    def _streamed(
+        self, method: str, path: str, json: JsonValue = None, headers: dict[str, str] | None = None
+    ) -> Iterator[httpx.Response]:
         try:
-            with self._http.stream("GET", path, headers={"Last-Event-ID": str(last)}) as answer:
+            with self._http.stream(method, path, json=json, headers=headers) as answer:
                 if answer.is_error:
                     answer.read()
                 self._check(answer)
-                yield from parsed(answer.iter_lines())
+                yield answer
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
 

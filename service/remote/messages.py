@@ -15,7 +15,6 @@ from t6gps.storage.sql.query import SQL_BYTES_N
 WAIT_S = 60.0
 """The longest that a request may wait for its effect."""
 LIFETIME_DAYS_MOST = 366.0
-ARROW = "application/vnd.apache.arrow.stream"
 
 RunName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]*$")]
@@ -80,10 +79,20 @@ class ScaleRequest(Message):
     deadline_s: Number = Field(30.0, ge=0.0, le=WAIT_S)
 
 
+class QueryForm(StrEnum):
+    """Forms of a query's result; a head is the first rows as texts for people."""
+
+    ARROW = "arrow"
+    CSV = "csv"
+    JSON = "json"
+    HEAD = "head"
+
+
 class QueryRequest(Message):
-    """One SELECT."""
+    """One SELECT, and the form of its result."""
 
     sql: Annotated[str, StringConstraints(max_length=SQL_BYTES_N)]
+    form: Annotated[QueryForm, Field(strict=False)] = QueryForm.ARROW
 
 
 class TokenRequest(Message):

@@ -3,19 +3,19 @@
 from __future__ import annotations
 
 import tempfile
-from collections.abc import AsyncIterator
+from collections.abc import AsyncIterator, Iterable
+from dataclasses import asdict
 from http import HTTPStatus
 from typing import Annotated
 
 import numpy as np
-import pyarrow as pa
 from fastapi import APIRouter, Header, HTTPException, Path
-from fastapi.responses import Response, StreamingResponse
+from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from t6gps.service.api import policy as policies
 from t6gps.service.pool import control
-from t6gps.service.remote.messages import ARROW, QueryRequest
+from t6gps.service.remote.messages import QueryForm, QueryRequest
 from t6gps.service.server import updates
 from t6gps.service.server.access import REFUSALS, NamedRun, Place, Reading, Slots
 from t6gps.service.training import evaluation, summary
@@ -27,10 +27,17 @@ from t6gps.storage.sql import query as sql
 routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS, tags=["read"])
 ITERATIONS_MOST = 10**9
 CHUNK_BYTES_N = 2**16
+ARCHIVE = "application/octet-stream"
+MEDIA = {
+    QueryForm.ARROW: "application/vnd.apache.arrow.stream",
+    QueryForm.CSV: "text/csv",
+    QueryForm.JSON: "application/json",
+}
 
 
-def _content(kind: str, what: str) -> dict[int | str, dict[str, object]]:
-    return {200: {"content": {kind: {"schema": {"type": "string", "format": "binary"}}}, "description": what}}
+def _contents(kinds: Iterable[str], what: str) -> dict[int | str, dict[str, object]]:
+    """What a route answers with, for the document."""
+    return {200: {"content": {kind: {} for kind in kinds}, "description": what}}
 
 
 @routes.get("")
@@ -65,7 +72,7 @@ def figures(run: NamedRun) -> list[str]:
     return sorted(path.name for path in run.figures.glob("*.png"))
 
 
-@routes.get("/{name}/figures/{figure}", response_class=Response, responses=_content("image/png", "A picture."))
+@routes.get("/{name}/figures/{figure}", response_class=Response, responses=_contents(["image/png"], "A picture."))
 def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> Response:
     """A figure as PNG."""
     found = {path.name: path for path in run.figures.glob("*.png")}
@@ -85,7 +92,7 @@ def versions(run: NamedRun) -> list[int]:
 @routes.get(
     "/{name}/policies/{version}",
     response_class=Response,
-    responses=_content("application/octet-stream", "An .npz archive without pickle."),
+    responses=_contents([ARCHIVE], "An .npz archive without pickle."),
 )
 def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)], place: Place) -> Response:
     """Weights of a policy: `offset_m`, `scale_m`, and `weight_K`, `bias_K` of each layer."""
@@ -96,27 +103,28 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)
     arrays = {"offset_m": np.array(snapshot.offset_m), "scale_m": np.array(snapshot.scale_m)}
     weights = {f"weight_{k}": weight for k, (weight, _) in enumerate(snapshot.layers)}
     biases = {f"bias_{k}": bias for k, (_, bias) in enumerate(snapshot.layers)}
-    return Response(checkpoint.packed({**arrays, **weights, **biases}), media_type="application/octet-stream")
+    return Response(checkpoint.packed({**arrays, **weights, **biases}), media_type=ARCHIVE)
 
 
-@routes.post("/{name}/query", response_class=Response, responses=_content(ARROW, "An Arrow IPC stream."))
+@routes.post("/{name}/query", response_class=Response, responses=_contents(MEDIA.values(), "The result."))
 def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
     """The result of one SELECT over the tables frames, episodes, iterations and classes."""
-    with place.reading.taken():
-        table = sql.query(run, question.sql)
+    if question.form is QueryForm.HEAD:
+        with place.reading.taken():
+            return JSONResponse(asdict(sql.head(run, question.sql)))
     file = tempfile.TemporaryFile()  # noqa: SIM115 # whoever takes it slowly holds no memory, and the end closes it
-    with pa.ipc.new_stream(file, table.schema) as writer:
-        writer.write_table(table)
+    with place.reading.taken():
+        sql.write(run, question.sql, question.form, file)
     size_n = file.tell()
     file.seek(0)
     chunks = iter(lambda: file.read(CHUNK_BYTES_N), b"")
-    return StreamingResponse(chunks, media_type=ARROW, headers={"Content-Length": str(size_n)})
+    return StreamingResponse(chunks, media_type=MEDIA[question.form], headers={"Content-Length": str(size_n)})
 
 
 @routes.get(
     "/{name}/events",
     response_class=StreamingResponse,
-    responses={200: {"content": {"text/event-stream": {"schema": {"type": "string"}}}, "description": "Events."}},
+    responses=_contents(["text/event-stream"], "Events."),
 )
 async def events(
     run: NamedRun,

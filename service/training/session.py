@@ -2,15 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
-from contextlib import closing
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import closing, contextmanager
 from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING, cast
 
 from t6gps.learner.port import Manifest
-from t6gps.service import caller
+from t6gps.service import caller, checks
 from t6gps.service import config as configuration
+from t6gps.service.checks import Wanted
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
 from t6gps.service.pool.state import RunState
@@ -19,7 +20,7 @@ from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import PhysicsError, RunError, TerrainError
+from t6gps.storage.errors import LearnerDiedError, RunError
 
 if TYPE_CHECKING:
     from t6gps.workers.physics import engine as physics
@@ -81,9 +82,10 @@ def begin(config: Config, root: Path, name: str | None, default: str, resume: bo
     """The run of that name below `root`: a new one, or the one that there is, to `resume` it.
 
     Without a name it is `default`, or the first of default-2, default-3, ... that is free. RunError when the name is
-    taken or refused, when there is nothing to resume, or when it has another configuration. `warn` is told what made
-    the run and is another now.
+    taken or refused, when there is nothing to resume, when it has another configuration, or when the root takes no
+    more files. `warn` is told what made the run and is another now.
     """
+    checks.require((checks.root_folder,), Wanted(config.run.workers, root))
     if not resume:
         return origin.create(config, root, default if name is None else name, numbered=name is None)
     run = catalog.open_run(root, default if name is None else name)
@@ -102,22 +104,48 @@ def tell_changes(run: Run, warn: Warn) -> None:
 def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
     """Train what is missing of a run, evaluate its policy without noise, and keep the result.
 
-    Everything sampled is kept when KeyboardInterrupt comes. A run is removed whose first executor cannot start.
+    Everything sampled is kept when KeyboardInterrupt comes. A run is removed whose first executor does not start.
     """
-    with catalog.locked(run):
+    with catalog.locked(run), _named(run):
         config = origin.at_work(config, run)
         try:
             started = start_executor(config, serial, run)
-        except (RunError, PhysicsError, TerrainError):
+        except BaseException:
             catalog.discard_unused(run)
             raise
         with closing(started) as executor:
-            loop.train(config, run, executor, observer)
-            size = config.run
-            result = evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
+            result = train_and_evaluate(config, run, executor, observer)
             executor.close(RunState.DONE)
         evaluation.keep(run, result)
         return result
+
+
+@contextmanager
+def _named(run: Run) -> Iterator[None]:
+    """Let errors of the system that name no file, such as a full disk, name the run's folder."""
+    try:
+        yield
+    except OSError as error:
+        if error.filename is None:
+            error.filename = str(run.path)
+        raise
+
+
+def train_and_evaluate(config: Config, run: Run, executor: Executor, observer: Observer) -> Evaluation:
+    """Train what is missing of a run, then evaluate its policy without noise.
+
+    A learner that dies after the last iteration is replaced, as one that dies before.
+    """
+    deaths_n, size = 0, config.run
+    while True:
+        loop.train(config, run, executor, observer)
+        try:
+            return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
+        except LearnerDiedError:
+            deaths_n += 1
+            if deaths_n > loop.LEARNER_DEATHS_ALLOWED_N:
+                raise
+            executor.replace_learner()
 
 
 def evaluate_newest(run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:

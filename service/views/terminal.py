@@ -2,17 +2,15 @@
 
 from __future__ import annotations
 
-import json
-import math
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
 from dataclasses import asdict
+from itertools import accumulate
 from types import TracebackType
 from typing import Any
 
-import pyarrow as pa
-import pyarrow.csv
+from rich.cells import cell_len
 from rich.console import Console
 from rich.progress import (
     BarColumn,
@@ -27,12 +25,16 @@ from rich.table import Table
 
 from t6gps.learner.phases import PHASES
 from t6gps.service.training.evaluation import Evaluation
+from t6gps.storage.sql.query import Head
 
 console = Console(stderr=True)
 """Progress and messages go to stderr, results to stdout, so that results can be piped."""
 
 PHASE_TITLES = {"sample": "sampling", **{phase.name: phase.title for phase in PHASES}, "evaluate": "evaluation"}
 """What the bar of each phase says."""
+
+CELL_MARGIN_N = 3
+"""Characters of a column beside its text: a space on both sides, and a line."""
 
 LEARNING_COLUMNS = {
     "iteration": ("iteration", "{:d}"),
@@ -169,12 +171,51 @@ def _columns() -> tuple[ProgressColumn, ...]:
 
 def print_rows(title: str, rows: Sequence[Mapping[str, object]], columns: Mapping[str, tuple[str, str]]) -> None:
     """Print chosen columns of rows; a missing value is shown as '-'."""
+    cells = [["-" if row[k] is None else form.format(row[k]) for k, (_, form) in columns.items()] for row in rows]
+    _results().print(_table([heading for heading, _ in columns.values()], cells, title))
+
+
+def print_head(head: Head) -> None:
+    """Print the first rows and columns of a query's result, as many as fit, and say what is not shown."""
+    target = _results()
+    cells = [["-" if text is None else _printable(text, target.encoding) for text in row] for row in head.rows]
+    headings = [_printable(name, target.encoding) for name in head.columns]
+    shown_n = _fitting(headings, cells, target.width)
+    target.print(_table(headings[:shown_n], [row[:shown_n] for row in cells]))
+    counts = [
+        f"{shown} of {whole} {kind}"
+        for shown, whole, kind in ((len(cells), head.rows_n, "rows"), (shown_n, len(headings), "columns"))
+        if shown < whole
+    ]
+    notes = [f"{', '.join(counts)} shown"] * bool(counts) + ["long values shortened"] * head.shortened
+    if notes:
+        target.print(f"{', '.join(notes)}; --format csv gives all")
+
+
+def _results() -> Console:
+    """Where tables go: as wide as the terminal, or 200 characters into files and pipes."""
+    return Console(width=None if sys.stdout.isatty() else 200, markup=False, emoji=False, highlight=False)
+
+
+def _table(headings: Sequence[str], rows: Sequence[Sequence[str]], title: str | None = None) -> Table:
     table = Table(title=title, title_justify="left")
-    for heading, _ in columns.values():
+    for heading in headings:
         table.add_column(heading, justify="right")
     for row in rows:
-        table.add_row(*("-" if row[k] is None else form.format(row[k]) for k, (_, form) in columns.items()))
-    Console(width=None if sys.stdout.isatty() else 200).print(table)
+        table.add_row(*row)
+    return table
+
+
+def _fitting(headings: Sequence[str], rows: Sequence[Sequence[str]], width: int) -> int:
+    """How many of the first columns fit into a table of `width` characters; one at least."""
+    widths = [max(map(cell_len, column)) + CELL_MARGIN_N for column in zip(headings, *rows, strict=True)]
+    return max(1, sum(total < width for total in accumulate(widths)))
+
+
+def _printable(text: str, encoding: str) -> str:
+    """Text on one line, with escapes for what would steer the terminal or is not in its encoding."""
+    steady = "".join(c if c.isprintable() else c.encode("unicode_escape").decode() for c in text)
+    return steady.encode(encoding, "backslashreplace").decode(encoding)
 
 
 def print_evaluation(result: Evaluation) -> None:
@@ -182,51 +223,3 @@ def print_evaluation(result: Evaluation) -> None:
     title = f"Noise-free policy, {result.episodes} unseen episodes (seed {result.seed})"
     columns = {"key": ("quantity", "{}"), "mean": ("mean", "{:.4f}"), "standard_error": ("standard error", "{:.4f}")}
     print_rows(title, [{"key": name, **asdict(estimate)} for name, estimate in result.estimates().items()], columns)
-
-
-def write_table(table: pa.Table, form: str) -> None:
-    """Write a query's result to stdout as table, csv, json (a list of rows) or arrow (an IPC stream)."""
-    table = table.rename_columns(_distinct(table.column_names))
-    if form == "arrow":
-        with pa.ipc.new_stream(sys.stdout.buffer, table.schema) as stream:
-            stream.write_table(table)
-    elif form == "csv":
-        pyarrow.csv.write_csv(_with_text_lists(table), sys.stdout.buffer)
-    elif form == "json":
-        json.dump([_finite(row) for row in table.to_pylist()], sys.stdout, default=str, allow_nan=False)
-        sys.stdout.write("\n")
-    else:
-        shown = Table()
-        for name in table.column_names:
-            shown.add_column(name, justify="right", overflow="fold")
-        for row in table.to_pylist():
-            shown.add_row(*("-" if value is None else str(value) for value in row.values()))
-        Console(width=None if sys.stdout.isatty() else 200).print(shown)
-
-
-def _distinct(names: Sequence[str]) -> list[str]:
-    """Column names of which none comes twice: a, b, a_2."""
-    counts: dict[str, int] = {}
-    distinct = []
-    for name in names:
-        counts[name] = counts.get(name, 0) + 1
-        distinct.append(name if counts[name] == 1 else f"{name}_{counts[name]}")
-    return distinct
-
-
-def _finite(value: object) -> object:
-    """JSON has no numbers beside the finite ones: the others become null."""
-    if isinstance(value, dict):
-        return {key: _finite(item) for key, item in value.items()}
-    if isinstance(value, list):
-        return [_finite(item) for item in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
-
-
-def _with_text_lists(table: pa.Table) -> pa.Table:
-    """CSV has no lists: write them as JSON."""
-    for i, field in enumerate(table.schema):
-        if pa.types.is_nested(field.type):
-            text = [None if value is None else json.dumps(value) for value in table.column(i).to_pylist()]
-            table = table.set_column(i, field.name, pa.array(text, pa.string()))
-    return table

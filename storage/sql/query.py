@@ -9,9 +9,14 @@ from __future__ import annotations
 import json
 import mmap
 import os
+import shutil
 import subprocess
 import sys
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import BinaryIO
 
 import pyarrow as pa
 
@@ -22,25 +27,69 @@ from t6gps.storage.sql import sandbox
 
 SQL_BYTES_N = 64 * 1024
 BRACKET_DEPTH_N = 100
-# Allocators that reserve address space per thread would eat the child's bound before the query starts.
-_ENVIRONMENT = {"ARROW_DEFAULT_MEMORY_POOL": "system", "MALLOC_ARENA_MAX": "2", "OMP_NUM_THREADS": "1"}
+_ENVIRONMENT = {
+    # Allocators that reserve address space per thread would eat the child's bound before the query starts.
+    "ARROW_DEFAULT_MEMORY_POOL": "system",
+    "MALLOC_ARENA_MAX": "2",
+    "OMP_NUM_THREADS": "1",
+    "PYTHONIOENCODING": "utf-8",  # of its refusal, whatever the locale
+}
+
+
+@dataclass(frozen=True)
+class Head:
+    """The first rows of a result, as short texts for people.
+
+    columns     names, each once
+    rows        texts, null where there is no value; at most formats.HEAD_ROWS_N
+    rows_n      rows of the whole result
+    shortened   whether a value is longer than its text
+    """
+
+    columns: list[str]
+    rows: list[list[str | None]]
+    rows_n: int
+    shortened: bool
 
 
 def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
     """The result of one SELECT over the tables frames, episodes, iterations and classes of `run`.
 
-    Only committed iterations are seen. Raises QueryError, with DuckDB's own sentence first where there is
-    one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a
-    result of 1 GB or `timeout_s` seconds.
+    Only committed iterations are seen. Of two columns with one name, the second gets a number: cost, cost_1. Raises
+    QueryError, with DuckDB's own sentence first where there is one, for SQL that is refused or wrong, and beyond 64 kB
+    of SQL, 100 nested brackets, 2 GiB of memory, a result of 1 GB or `timeout_s` seconds.
     """
+    with _answer(run, sql, "arrow", timeout_s) as result:
+        return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
+
+
+def write(run: Run, sql: str, form: str, sink: BinaryIO, *, timeout_s: float = 30.0) -> None:
+    """Write what `query` would return as arrow (an IPC stream), csv or json, once the whole result is there.
+
+    Its size is that of a file, not of memory. Raises QueryError as `query` does; nothing is written then.
+    """
+    with _answer(run, sql, form, timeout_s) as result:
+        shutil.copyfileobj(result, sink)
+    sink.flush()
+
+
+def head(run: Run, sql: str, *, timeout_s: float = 30.0) -> Head:
+    """The first rows of what `query` would return. Raises QueryError as `query` does; the result has no bound."""
+    with _answer(run, sql, "head", timeout_s) as result:
+        return Head(**json.load(result))
+
+
+@contextmanager
+def _answer(run: Run, sql: str, form: str, timeout_s: float) -> Iterator[BinaryIO]:
+    """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
     _check_size(sql)
     iterations_n, files = tables.files(run)
-    question = json.dumps({"sql": sql, "iterations_n": iterations_n, "files": files, "timeout_s": timeout_s})
+    question = {"sql": sql, "form": form, "iterations_n": iterations_n, "files": files, "timeout_s": timeout_s}
     with tempfile.TemporaryFile() as result:
         try:
             child = subprocess.run(
                 [sys.executable, "-P", "-m", sandbox.__name__],
-                input=question.encode(),
+                input=json.dumps(question).encode(),
                 stdout=result,
                 stderr=subprocess.PIPE,
                 env={**os.environ, **_ENVIRONMENT},
@@ -54,7 +103,8 @@ def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
             ) from error
         if child.returncode:
             raise QueryError(_reason(child.returncode, child.stderr.decode(errors="replace").strip()))
-        return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
+        result.seek(0)
+        yield result
 
 
 def _check_size(sql: str) -> None:

@@ -1,28 +1,30 @@
 """The child process of `query`: one SELECT over the tables of a run, with everything else locked away.
 
-It takes a question as JSON from its standard input, streams the result as Arrow IPC to its standard output,
-and says on its standard error why it refused. Only DuckDB and pyarrow are loaded, and pandas where somebody installed
-it, since pyarrow.dataset then imports it: it starts in a fraction of a second.
+It takes a question as JSON from its standard input, writes the result to its standard output in the form that is
+asked for (`formats`), and says on its standard error why it refused. Only DuckDB and pyarrow are loaded, and pandas
+where somebody installed it, since pyarrow.dataset then imports it: it starts in a fraction of a second.
 """
 
 from __future__ import annotations
 
+import errno
 import json
 import math
 import resource
 import sys
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
 import duckdb
 import pyarrow as pa
 
-from t6gps.storage import parquet, schema
+from t6gps.storage import parquet
 from t6gps.storage.errors import QueryError
+from t6gps.storage.sql import advice, formats
 
 RESULT_BYTES_N = 10**9
 MEMORY_BYTES_N = 2 * 1024**3
-MESSAGE_LENGTH_N = 10_000
 REFUSED, TOO_LARGE = 2, 3
 
 _THREADS_N = 2
@@ -32,10 +34,6 @@ _SETTINGS = (
     "SET temp_directory = ''",
     "SET enable_external_access = false",  # also extensions, and the variables of this program
     "SET lock_configuration = true",
-)
-_ALLOWED = (
-    "allowed is one SELECT (or WITH ... SELECT, DESCRIBE, SHOW TABLES) over the tables "
-    f"{', '.join(schema.TABLES)}; files, settings and extensions are out of reach"
 )
 
 
@@ -48,11 +46,13 @@ def _limit(timeout_s: float) -> None:
         (resource.RLIMIT_AS, memory),
         (resource.RLIMIT_CPU, processor_s),
         (resource.RLIMIT_CORE, 0),
+        (resource.RLIMIT_FSIZE, RESULT_BYTES_N),  # the result is the only file that is written
     ):
-        resource.setrlimit(kind, (bound, bound))
+        least = min(most for most in (bound, *resource.getrlimit(kind)) if most != resource.RLIM_INFINITY)
+        resource.setrlimit(kind, (least, least))
 
 
-def _answer(question: dict[str, Any]) -> pa.RecordBatchReader:
+def _relation(question: Mapping[str, Any]) -> duckdb.DuckDBPyRelation:
     connection = duckdb.connect(":memory:")
     for table, files in question["files"].items():
         connection.register(table, parquet.rows(table, files, question["iterations_n"]))
@@ -61,40 +61,22 @@ def _answer(question: dict[str, Any]) -> pa.RecordBatchReader:
     _limit(question["timeout_s"])
     statements = connection.extract_statements(question["sql"])
     if [statement.type for statement in statements] != [duckdb.StatementType.SELECT]:
-        found = ", ".join(statement.type.name for statement in statements) or "nothing"
-        raise QueryError(f"this SQL is refused: found {found}")
-    return connection.sql(question["sql"]).to_arrow_reader()
-
-
-def _explained(error: Exception) -> str:
-    """The error's own sentence first, then what there is or what to do."""
-    message = str(error)[:MESSAGE_LENGTH_N]
-    if isinstance(error, MemoryError) or message.startswith("Out of Memory"):
-        message = message.split("\n", 1)[0]  # DuckDB's own advice is to change settings, which are locked
-        remedy = "select fewer columns, filter by iteration, or aggregate before joining or sorting"
-    elif isinstance(error, duckdb.CatalogException | duckdb.BinderException):
-        remedy = "\n".join(f"{table}: {', '.join(columns.names)}" for table, columns in schema.TABLES.items())
-    else:
-        remedy = _ALLOWED
-    return f"{message}\n{remedy}"
+        raise QueryError(advice.refusal([statement.type.name for statement in statements]))
+    return connection.sql(question["sql"])
 
 
 def main() -> int:
     """Answer the question on the standard input; the exit status is 0, REFUSED or TOO_LARGE."""
     pa.set_cpu_count(_THREADS_N)
     pa.set_io_thread_count(_THREADS_N)
-    written_n = 0
+    question = json.load(sys.stdin)
     try:
-        reader = _answer(json.load(sys.stdin))
-        with pa.ipc.new_stream(sys.stdout.buffer, reader.schema) as stream:
-            for batch in reader:
-                written_n += batch.nbytes
-                if written_n > RESULT_BYTES_N:
-                    return TOO_LARGE
-                stream.write_batch(batch)
-        sys.stdout.flush()
+        with open(sys.stdout.fileno(), "wb", closefd=False) as result:  # its last bytes may not fit either
+            formats.write(_relation(question), question["form"], result)
     except (duckdb.Error, pa.ArrowException, OSError, MemoryError, QueryError) as error:
-        print(_explained(error), file=sys.stderr)
+        if isinstance(error, OSError) and error.errno == errno.EFBIG:
+            return TOO_LARGE
+        print(advice.explained(error, question["sql"]), file=sys.stderr)
         return REFUSED
     return 0
 

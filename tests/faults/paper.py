@@ -52,6 +52,7 @@ class Paper(Transport):
         self.starts: list[tuple[int, int, float]] = []
         self.reports: list[Report] = []
         self.fails_to_start = False
+        self.hold_back = False
         self.settings = SETTINGS
         self.digest = "policy"
         self.episode_s = EPISODE_S
@@ -101,12 +102,14 @@ class Paper(Transport):
                 if paper.queue[0].episode_id in self.crashing:
                     self.die(worker)
                     break
-                plan = paper.queue.pop(0)
+                plan, at_s = paper.queue.pop(0), paper.until_s
                 paper.until_s = self.now_s + self.episode_s
                 result: Episode | Failure = stub.episode(plan, POLICY)
                 if plan.episode_id in self.raising:
                     result = Failure(FailureKind.RAISED, "PhysicsError", "it fell over", plan.seed, 2)
-                self.reports.append(Done(worker, plan, result, self.digest))
+                self.reports.append(Done(worker, plan, result, at_s, self.digest))
+        if self.hold_back:
+            return []
         reports, self.reports = self.reports, []
         return reports
 

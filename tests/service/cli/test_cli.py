@@ -140,7 +140,7 @@ def test_a_root_that_cannot_hold_runs_is_refused(tmp_path: Path) -> None:
     file = tmp_path / "file"
     file.write_text("")
     refused = t6gps("train", "flat-quick", "--root", file / "runs", code=2)
-    assert "must be a writable folder" in refused.stderr
+    assert "needed: a writable folder" in refused.stderr
 
 
 @pytest.mark.slow

@@ -3,7 +3,9 @@
 import os
 import signal
 from collections.abc import Iterator
+from contextlib import closing
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -18,7 +20,7 @@ from t6gps.service.config import Config, load
 from t6gps.service.execution.executor import Executor
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.execution.serial import SerialExecutor
-from t6gps.service.training import loop
+from t6gps.service.training import evaluation, loop, session
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.workers.episode import policy
@@ -127,6 +129,33 @@ def test_t10_t15_a_killed_worker_and_a_killed_learner_change_no_byte(
     assert result_of(config, executor, tmp_path, kills) == request.getfixturevalue(expected)
     assert kills.done == {"worker", "learner"}
     assert executor.pool.state.counters["crashed"] == 1
+
+
+class KillsAtTheEnd(Watcher):
+    """Kills the learner when the last iteration is committed."""
+
+    def __init__(self, executor: RayExecutor, iterations: int) -> None:
+        super().__init__()
+        self.executor, self.iterations, self.killed_n = executor, iterations, 0
+
+    def finished(self, row: dict[str, Any]) -> None:
+        super().finished(row)
+        if len(self.rows) == self.iterations:
+            self.executor.learner.kill()
+            self.killed_n += 1
+
+
+@pytest.mark.slow
+def test_t10_a_learner_that_dies_before_the_evaluation_is_replaced(
+    ray_head: dict[str, str], tmp_path: Path, tiny: Trained
+) -> None:
+    config = load("flat-quick", [*TINY, "run.workers=2"])
+    run = catalog.create(tmp_path, "run", config.to_json())
+    with joining(ray_head), closing(RayExecutor(config)) as executor:
+        kills = KillsAtTheEnd(executor, config.run.iterations)
+        result = session.train_and_evaluate(config, run, executor, kills)
+    assert kills.killed_n == 1
+    assert result == evaluation.kept(tiny.run)
 
 
 @pytest.mark.slow

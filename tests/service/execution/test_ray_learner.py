@@ -19,6 +19,8 @@ from t6gps.service.config import load
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.execution.ray_learner import EPISODES_PER_CALL_N, EPISODES_UNDER_WAY_N
 from t6gps.service.execution.serial import SerialExecutor
+from t6gps.service.pool.deadlines import Timings
+from t6gps.storage.errors import LearnerDiedError
 from t6gps.storage.records import Episode
 
 SETTINGS = ["run.episodes=60", "run.steps=10", "learner.smallest_class_segments=4", "learner.epochs=1"]
@@ -66,3 +68,19 @@ def test_t13_while_the_learner_stands_still_sampling_waits_and_then_ends_with_th
         streamed.layers, serial.learner.policy().layers, strict=True
     ):
         assert (weight == expected_weight).all() and (bias == expected_bias).all()
+
+
+@pytest.mark.slow
+def test_t10_a_learner_that_hangs_is_ended_and_another_one_takes_its_place(ray_head: dict[str, str]) -> None:
+    config = load("flat-quick", [*SETTINGS, f"run.workers={WORKERS_N}", "run.cpus_per_worker=0.5"])
+    timings = Timings(learner_silent_s=4.0)
+    with joining(ray_head), closing(RayExecutor(config, timings=timings)) as executor:
+        first: Any = executor.learner.actor
+        untrained = executor.learner.policy()
+        os.kill(ray.get(first.__ray_call__.remote(lambda _: os.getpid())), signal.SIGSTOP)
+        with pytest.raises(LearnerDiedError, match=r"no sign of life for .* stopped"):
+            executor.learner.policy()
+        executor.replace_learner()
+        again = executor.learner.policy()
+    for (weight, _), (before, _) in zip(again.layers, untrained.layers, strict=True):
+        assert (weight == before).all()

@@ -16,6 +16,7 @@ from t6gps.service.pool.state import (
     NEXT_STATES,
     WorkerPhase,
 )
+from t6gps.service.pool.supervisor import GRACE_S
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import EpisodePlan
 
@@ -137,6 +138,38 @@ def test_a_worker_ten_times_slower_does_not_hang() -> None:
     house.pool.open([EpisodePlan(9, 0, 9, 1, 4, 0, 0.0, 0.1, 0)], [], {0: "policy"})
     assert house.sample() == [9]
     assert house.pool.state.counters["hung"] == 0
+
+
+def test_an_episode_took_as_long_as_it_took_however_late_the_supervisor_looks() -> None:
+    house = House(1, 6)
+    late_s = 50 * EPISODE_S
+
+    def stand_still(found: list[int]) -> None:
+        if len(found) == 3:
+            house.paper.now_s += late_s
+
+    assert sorted(house.sample(stand_still)) == list(range(6))
+    steps_n = plans(1)[0].steps
+    assert max(house.pool.state.times.per_step_s) * steps_n < 2 * EPISODE_S
+
+
+def test_after_a_pause_of_the_supervisor_itself_nobody_is_late_at_once() -> None:
+    house = House(2, 10)
+    house.until(lambda: len(house.ledger.leases) == 2 * PLANS_PER_WORKER, 5)
+    house.paper.hold_back = True  # what the workers did is still on its way when the supervisor looks again
+    house.paper.now_s += 10_000
+    house.pool.tick()
+    house.paper.hold_back = False
+    assert sorted(house.sample()) == list(range(10))
+    assert house.pool.state.counters["hung"] == 0
+
+
+def test_a_worker_that_hangs_through_a_pause_of_the_supervisor_is_found_after_it() -> None:
+    house = House(1, 3)
+    house.paper.hanging.add(0)
+    house.until(lambda: bool(house.ledger.leases), 5)
+    house.paper.now_s += 10_000
+    assert house.until(lambda: house.pool.state.counters["hung"] == 1, 5) <= GRACE_S + 0.2
 
 
 def test_deadlines_follow_the_measured_times_and_the_length_of_the_episode() -> None:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import subprocess
 import sys
 from pathlib import Path
@@ -12,7 +13,7 @@ from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import QueryError
 from t6gps.storage.sql import sandbox
-from t6gps.storage.sql.query import query
+from t6gps.storage.sql.query import query, write
 
 
 @pytest.fixture(scope="module")
@@ -53,18 +54,37 @@ def test_a_run_without_iterations_has_empty_tables_with_every_column(empty: Run)
 
 
 @pytest.mark.parametrize(
-    ("sql", "sentence"),
+    ("sql", "words"),
     [
-        ("SELECT speed FROM frames", 'Binder Error: Referenced column "speed" not found'),
-        ("SELECT * FROM frame", "Catalog Error: Table with name frame does not exist"),
+        ("SELECT cots FROM frames", ['column "cots" not found', '"cost"', "frames: episode_id"]),
+        ("SELECT e.steeps FROM Episodes e", ['column named "steeps"', "did you mean steps?", "episodes: episode_id"]),
+        ("SELECT * FROM frame", ["name frame does not exist", "did you mean frames?", "frames, episodes, iterations"]),
+        ("SELECT avgg(cost) FROM frames", ['Did you mean "avg"?']),
     ],
 )
-def test_an_unknown_name_is_answered_with_the_tables_and_their_columns(empty: Run, sql: str, sentence: str) -> None:
+def test_a_wrong_name_is_answered_with_the_nearest_and_what_the_asked_tables_have(
+    empty: Run, sql: str, words: list[str]
+) -> None:
     with pytest.raises(QueryError) as caught:
         query(empty, sql)
-    assert str(caught.value).splitlines()[0].startswith(sentence)
-    for name, definition in schema.TABLES.items():
-        assert f"{name}: {', '.join(definition.names)}" in str(caught.value)
+    for word in words:
+        assert word in str(caught.value)
+    assert "classes: " not in str(caught.value)
+
+
+def test_a_pivot_is_told_to_name_its_values(empty: Run) -> None:
+    with pytest.raises(QueryError, match=r"ON ended_by IN \('completed'\)"):
+        query(empty, "PIVOT episodes ON ended_by USING count(*)")
+    named = query(empty, "PIVOT episodes ON ended_by IN ('completed') USING count(*) GROUP BY iteration")
+    assert named.column_names == ["iteration", "completed"]
+
+
+def test_nothing_is_written_of_a_result_that_fails_at_its_end(empty: Run) -> None:
+    sink = io.BytesIO()
+    for form in ("arrow", "csv", "json"):
+        with pytest.raises(QueryError, match="Conversion Error"):
+            write(empty, "SELECT if(range = 90000, 'x', '1')::INT AS n FROM range(100000)", form, sink)
+    assert sink.getvalue() == b""
 
 
 @pytest.mark.slow
