@@ -6,7 +6,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
-from typing import BinaryIO, Protocol, final
+from typing import TYPE_CHECKING, BinaryIO, Protocol, final
 
 from t6gps.service.pool import control
 from t6gps.service.pool.control import Status
@@ -16,6 +16,9 @@ from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.sql import query
 from t6gps.storage.sql.query import Head
+
+if TYPE_CHECKING:
+    from t6gps.service.remote.client import Client
 
 
 class Door(Protocol):
@@ -70,6 +73,13 @@ def opened(root: Path, server: str | None) -> Iterator[Door]:
     if server is None:
         yield Local(root)
         return
+    with connected(server) as client:
+        yield client
+
+
+@contextmanager
+def connected(server: str) -> Iterator[Client]:
+    """The client of a server. ConfigError where it is not installed."""
     try:
         from t6gps.service.remote.client import Client
     except ModuleNotFoundError as error:

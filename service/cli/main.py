@@ -28,6 +28,7 @@ from t6gps.service.cli.options import (
     Root,
     RunName,
     Serial,
+    Server,
     Workers,
     with_workers,
 )
@@ -69,6 +70,7 @@ def train(
     source: Annotated[str, typer.Argument(metavar="PRESET|FILE.toml", help="Preset name or TOML file.")],
     run_name: Annotated[str | None, typer.Option("--run", help="Name of the run; by default the preset's.")] = None,
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     workers: Workers = None,
     autoscale: Autoscale = None,
     serial: Serial = False,
@@ -76,6 +78,9 @@ def train(
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
+    if server is not None:
+        serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
+        return
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
     run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
     try:

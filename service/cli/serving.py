@@ -9,6 +9,8 @@ from typing import Annotated
 
 import typer
 
+from t6gps.service import config as configuration
+from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
@@ -53,6 +55,21 @@ def serve(
         serving.serve(root, address, terminal.say)
     except KeyboardInterrupt:
         terminal.say("the server has ended; runs at work go on")
+
+
+def train_there(
+    server: str, preset: str, run_name: str | None, overrides: list[str], serial: bool, resume: bool
+) -> None:
+    """Let a server train a run, or resume one, and say how to follow it. ConfigError for what only works here."""
+    if serial:
+        raise ConfigError("--serial computes in this process, which a server cannot; leave out --serial or --server")
+    with door.connected(server) as client:
+        if resume:
+            started = client.resume(preset if run_name is None else run_name)
+        else:
+            started = client.start(preset, run_name, dict(map(configuration.assigned, overrides)))
+    typer.echo(f"run {started.name} is at work in process {started.pid} of the server")
+    terminal.say(f"follow it with: t6gps status {started.name} --server {server}")
 
 
 @token.command()

@@ -19,7 +19,9 @@ import pytest
 from command import t6gps
 from loopback import Server
 
+from t6gps.service import config as configuration
 from t6gps.service.remote.messages import Scope
+from t6gps.storage import catalog
 
 
 @contextmanager
@@ -174,6 +176,21 @@ def test_a_server_that_cannot_be_asked_is_one_error(
 def test_a_token_of_another_server_is_one_error(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setenv("T6GPS_TOKEN", "t6gps_nothing")
     assert "t6gps token create" in t6gps("runs", "--server", server.url, code=2).stderr
+
+
+def test_a_server_is_told_to_train_with_the_settings_of_the_command(
+    server: Server, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("T6GPS_TOKEN", server.tokens[Scope.OPERATE])
+    settings = ["--set", "run.iterations=2", "--set=task.directions=36", "--workers", "3"]
+    said = t6gps("train", "flat-quick", "--run", "far", *settings, "--server", server.url).stdout.decode()
+    assert "far" in said
+    config = configuration.kept(catalog.open_run(server.root, "far"))
+    assert (config.run.iterations, config.run.workers, config.task.directions) == (2, 3, 36)
+    t6gps("train", "walk", "--resume", "--server", server.url)
+    assert server.launched == ["far", "walk"]
+    for refused, words in ((["flat-quick", "--serial"], "--serial"), (["mine.toml"], "unknown preset")):
+        assert words in t6gps("train", *refused, "--server", server.url, code=2).stderr
 
 
 def test_scaling_over_a_server_needs_its_scope(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
