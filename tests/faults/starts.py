@@ -2,7 +2,8 @@
 
     python tests/faults/starts.py [--json] [PATTERN]
 
-Starts a small training under each condition whose name holds PATTERN, and stops one by SIGTERM in each of its phases.
+Starts a small training under each condition whose name holds PATTERN, and stops one in each of its phases, by SIGTERM
+and by Ctrl-C.
 Prints what came of it and how long it took; with --json as docs/figures/starts.json has it. Conditions that this
 machine cannot make are passed over with a word. `test_starts.py` runs some of them.
 """
@@ -23,6 +24,7 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import date
+from itertools import product
 from pathlib import Path
 
 from t6gps.service import provenance
@@ -109,8 +111,9 @@ CONDITIONS = (
     ),
     Condition(
         "RAY_ADDRESS=auto without a cluster",
-        'TMPDIR=$PWD exec "$@"',  # Ray notes there which cluster there is
+        'TMPDIR=$PWD exec unshare -rpf --mount-proc "$@"',  # Ray looks there, and at all processes of the machine
         says=r"ray start --head.*unset",
+        needs="unshare -rpf --mount-proc true",
         environment={"RAY_ADDRESS": "auto"},
     ),
     Condition(
@@ -164,7 +167,10 @@ def possible(condition: Condition) -> bool:
 
 @contextmanager
 def launched(condition: Condition, folder: Path) -> Iterator[tuple[subprocess.Popen[bytes], str]]:
-    """The command under the condition, and the mark of its processes; nothing of it is left at the end."""
+    """The command under the condition, and the mark of its processes; nothing of it is left at the end.
+
+    It heeds Ctrl-C, which a shell's background jobs do not.
+    """
     mark = uuid.uuid4().hex
     known = {name: value for name, value in os.environ.items() if not name.startswith("RAY_")}
     changed = known | {MARK: mark} | {n: v for n, v in condition.environment.items() if v is not None}
@@ -173,7 +179,7 @@ def launched(condition: Condition, folder: Path) -> Iterator[tuple[subprocess.Po
     with (folder / "said").open("wb") as said:
         process = subprocess.Popen(
             command, cwd=folder, env=environment, stdin=subprocess.DEVNULL, stdout=said, stderr=said,
-            start_new_session=True,
+            start_new_session=True, preexec_fn=lambda: signal.signal(signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
         )  # fmt: skip
     try:
         yield process, mark
@@ -239,6 +245,7 @@ def has_process(name: str) -> Callable[[str, Path], bool]:
     return lambda mark, _: any(name in processes.command(pid) for pid in marked(mark))
 
 
+STOPS = {"SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
 PHASES: dict[str, Callable[[str, Path], bool]] = {
     "while Ray starts": has_process("gcs_server"),
     "while the policy server and the workers start": has_process("ray::"),
@@ -250,9 +257,9 @@ PHASES: dict[str, Callable[[str, Path], bool]] = {
 }
 
 
-def stop(phase: str, folder: Path) -> Outcome:
-    """Stop a training in a phase, and judge how it ends."""
-    condition, name = Condition(phase), f"SIGTERM {phase}"
+def stop(phase: str, how: str, folder: Path) -> Outcome:
+    """Stop a training in a phase by one of STOPS, and judge how it ends."""
+    condition, name = Condition(phase), f"{how} {phase}"
     with launched(condition, folder) as (process, mark):
         deadline = time.monotonic() + PATIENCE_S
         while not PHASES[phase](mark, folder / "runs" / "one"):
@@ -260,7 +267,7 @@ def stop(phase: str, folder: Path) -> Outcome:
                 return Outcome(name, "", 0.0, "the phase never came: " + (folder / "said").read_text()[-1500:])
             time.sleep(0.005)
         sent_s = time.monotonic()
-        process.send_signal(signal.SIGTERM)
+        process.send_signal(STOPS[how])
         try:
             code = process.wait(DEADLINE_S)
         except subprocess.TimeoutExpired:
@@ -270,7 +277,7 @@ def stop(phase: str, folder: Path) -> Outcome:
         wrong = "" if code in (0, 130) and "Traceback" not in text else f"it ended with {code}: {text[-1500:]}"
         wrong = wrong or ("" if took_s < STOP_DEADLINE_S else "too late") or left_over(mark)
         kept = (folder / "runs" / "one").exists()
-    return Outcome(name, "ends, and resumes" if kept else "ends, and leaves no run", took_s, wrong)
+    return Outcome(name, "ends, and keeps the run" if kept else "ends, and leaves no run", took_s, wrong)
 
 
 def outcomes(pattern: str) -> Iterator[Outcome]:
@@ -281,9 +288,9 @@ def outcomes(pattern: str) -> Iterator[Outcome]:
             print(f"{condition.name}: this machine cannot make it ({condition.needs})", file=sys.stderr)
             continue
         yield in_folder(lambda folder, condition=condition: start(condition, folder))
-    for phase in PHASES:
-        if pattern in phase:
-            yield in_folder(lambda folder, phase=phase: stop(phase, folder))
+    for phase, how in product(PHASES, STOPS):
+        if pattern in f"{how} {phase}":
+            yield in_folder(lambda folder, phase=phase, how=how: stop(phase, how, folder))
 
 
 def in_folder(judge: Callable[[Path], Outcome]) -> Outcome:

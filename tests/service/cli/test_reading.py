@@ -132,7 +132,7 @@ def test_reading_needs_no_permission_to_write(root: Path, tmp_path: Path) -> Non
         t6gps("eval", "tiny", "--episodes", "2", "--serial", "--root", root)
         refused = t6gps("train", "flat-quick", "--run", "tiny", "--resume", "--serial", *tiny_run.settings(),
                         "--root", root, code=2)  # fmt: skip
-    assert "permission to write" in refused.stderr
+    assert "permission is missing" in refused.stderr
 
 
 def test_what_a_run_was_made_with_and_is_another_now_is_a_warning(root: Path) -> None:
