@@ -8,11 +8,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import TYPE_CHECKING, BinaryIO, Protocol, final
 
+import pyarrow as pa
+
 from t6gps.service.pool import control
 from t6gps.service.pool.control import Status
-from t6gps.service.training import summary
+from t6gps.service.training import evaluation, origin, summary
+from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
-from t6gps.storage import catalog
+from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.sql import query
 from t6gps.storage.sql.query import Head
@@ -29,6 +32,10 @@ class Door(Protocol):
     def status(self, name: str) -> Status: ...
 
     def scale(self, name: str, workers: int, deadline_s: float) -> Status: ...
+
+    def table(self, name: str, table: str) -> pa.Table: ...
+
+    def evaluation(self, name: str) -> Evaluation | None: ...
 
     def head(self, name: str, sql: str) -> Head: ...
 
@@ -57,6 +64,17 @@ class Local:
     def scale(self, name: str, workers: int, deadline_s: float) -> Status:
         """Give a running run so many workers; its status then."""
         return control.scale(catalog.open_run(self.root, name), workers, deadline_s)
+
+    def table(self, name: str, table: str) -> pa.Table:
+        """A table. An error for a run that is not whole."""
+        run = catalog.open_run(self.root, name)
+        origin.configured(run)
+        tables.files(run)
+        return tables.read(run, table)
+
+    def evaluation(self, name: str) -> Evaluation | None:
+        """What the last policy did without noise; None before the training has ended."""
+        return evaluation.kept(catalog.open_run(self.root, name))
 
     def head(self, name: str, sql: str) -> Head:
         """The first rows of the result of one SELECT."""

@@ -16,7 +16,7 @@ import typer
 from t6gps.service import config as configuration
 from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, Server
-from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training import origin, session
 from t6gps.service.training.summary import RunSummary
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
@@ -65,24 +65,24 @@ def _iterations(run: RunSummary) -> str:
     return "damaged" if run.fault is not None else f"{run.done} of {run.planned}"
 
 
-def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
+def show(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None) -> None:
     """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
-    run = catalog.open_run(root, run_name)
-    origin.configured(run)  # an error for a run that is not whole
-    if not tables.files(run)[0]:
-        typer.echo(f"run {run_name} has not finished an iteration yet")
-        return
-    print_learning(run)
-    classes = tables.read(run, "classes").to_pylist()
+    with door.opened(root, server) as there:
+        iterations = there.table(run_name, "iterations").sort_by("iteration").to_pylist()
+        if not iterations:
+            typer.echo(f"run {run_name} has not finished an iteration yet")
+            return
+        classes, result = there.table(run_name, "classes").to_pylist(), there.evaluation(run_name)
+    terminal.print_rows(f"Run {run_name}", iterations, terminal.LEARNING_COLUMNS)
     last = max((row["iteration"] for row in classes), default=-1)
     rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
     terminal.print_rows(f"Segment classes of iteration {last}", rows, terminal.CLASS_COLUMNS)
-    iterations = tables.read(run, "iterations").to_pylist()
     typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
-    result = evaluation.kept(run)
     if result:
         terminal.print_evaluation(result)
-    print_paths(run, sorted(run.figures.glob("*.png")), root)
+    if server is None:
+        run = catalog.open_run(root, run_name)
+        print_paths(run, sorted(run.figures.glob("*.png")), root)
 
 
 def query(

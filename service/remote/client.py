@@ -137,6 +137,10 @@ class Client:
         except pa.ArrowException as error:
             raise self._server.nonsense(error) from None
 
+    def table(self, name: str, table: str) -> pa.Table:
+        """A table of a run (docs/data.md)."""
+        return self.query(name, f"SELECT * FROM {table} ORDER BY iteration")
+
     def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
         """Write the result of one SELECT as arrow (an IPC stream), csv or json."""
         for chunk in self._server.chunks(f"{_run(name)}/query", checked(QueryRequest, sql=sql, form=form)):

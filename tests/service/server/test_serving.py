@@ -141,9 +141,12 @@ def test_commands_say_the_same_of_a_server_as_of_its_root(server: Server, monkey
         assert there.stdout == t6gps(*arguments, "--root", server.root).stdout
     rows = [t6gps("runs", *place).stdout.decode().partition("┏")[2] for place in places(server)]
     assert rows[0] == rows[1]
+    shown = [t6gps("show", "walk", *place).stdout.decode().partition("dataset")[0] for place in places(server)]
+    assert shown[0] == shown[1]
+    assert "Diagnosis" in shown[0]
     for arguments in (
         ["status", "walk"],
-        ["status", "none"],
+        ["show", "none"],
         ["query", "walk", "SELEC"],
         ["query", "walk", "SELECT x"],
     ):
