@@ -185,17 +185,22 @@ def differences(stored: Config, wanted: Config) -> list[str]:
     return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in NO_EFFECT]
 
 
+def assigned(override: str) -> tuple[str, JsonValue]:
+    """Key and value of an override `key=value`. ConfigError for another form."""
+    key, equals, text = override.partition("=")
+    if not equals or not key.strip():
+        raise ConfigError(f"--set takes key=value, found '{override}'; for example --set run.seed=3")
+    try:
+        value: JsonValue = tomllib.loads(f"value = {text}")["value"]
+    except tomllib.TOMLDecodeError:
+        value = text
+    return key.strip(), value
+
+
 def _overridden(values: dict[str, JsonValue], overrides: Sequence[str]) -> dict[str, JsonValue]:
     values = copy.deepcopy(values)
-    for override in overrides:
-        key, equals, text = override.partition("=")
-        if not equals or not key.strip():
-            raise ConfigError(f"--set takes key=value, found '{override}'; for example --set run.seed=3")
-        try:
-            value = tomllib.loads(f"value = {text}")["value"]
-        except tomllib.TOMLDecodeError:
-            value = text
-        *sections, name = key.strip().split(".")
+    for key, value in map(assigned, overrides):
+        *sections, name = key.split(".")
         table = values
         for section in sections:
             inner = table.setdefault(section, {})

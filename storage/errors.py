@@ -29,6 +29,10 @@ class QueryError(T6GpsError):
     """SQL that was refused, failed, or exceeded its limits."""
 
 
+class ServerError(T6GpsError):
+    """A server that cannot be started or reached, or that refuses who asks: token, scope, origin, size, rate."""
+
+
 class TerrainError(T6GpsError):
     """A terrain that cannot be built or stood on."""
 

@@ -9,14 +9,14 @@ from typing import Annotated
 
 import typer
 
-from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
+from t6gps.service.cli import door
+from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName, Server
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
 from t6gps.service.pool import control, crash_bundle
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.control import Status
 from t6gps.service.views import terminal
-from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 
 WORKER_COLUMNS = {
@@ -41,24 +41,27 @@ def scale(
     run_name: RunName,
     workers: Annotated[int, typer.Argument(metavar="N", help="Workers from now on; 0 pauses the run.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for them (s).")] = (
         control.SCALE_DEADLINE_S
     ),
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
-    job = records.find(root, run_name)
+    job = None if server else records.find(root, run_name)
     if job is None:
-        reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
+        with door.opened(root, server) as runs:
+            reached = runs.scale(run_name, workers, deadline_s)
     else:
         reached = launchers.serving(job).scale(job, workers, deadline_s)
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
-def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+def status(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    job = records.find(root, run_name)
+    job = None if server else records.find(root, run_name)
     if job is None:
-        _print_status(run_name, control.status(catalog.open_run(root, run_name)), as_json)
+        with door.opened(root, server) as runs:
+            _print_status(run_name, runs.status(run_name), as_json)
         return
     launcher = launchers.serving(job)
     known, (state, detail) = launcher.status(job), launcher.state(job)

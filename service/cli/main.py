@@ -19,7 +19,7 @@ import typer
 from t6gps.service import advice
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import doctor, launching, live, stored
+from t6gps.service.cli import doctor, launching, live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -28,6 +28,7 @@ from t6gps.service.cli.options import (
     Root,
     RunName,
     Serial,
+    Server,
     Workers,
     with_workers,
 )
@@ -69,6 +70,7 @@ def train(
     source: Annotated[str, typer.Argument(metavar="PRESET|FILE.toml", help="Preset name or TOML file.")],
     run_name: Annotated[str | None, typer.Option("--run", help="Name of the run; by default the preset's.")] = None,
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     workers: Workers = None,
     autoscale: Autoscale = None,
     serial: Serial = False,
@@ -78,6 +80,9 @@ def train(
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
+    if server is not None:
+        serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
+        return
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
     run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
     try:
@@ -179,6 +184,7 @@ def bench(
 stored.add_to(app)
 live.add_to(app)
 launching.add_to(app)
+serving.add_to(app)
 doctor.add_to(app)
 
 

@@ -12,6 +12,10 @@ from t6gps.storage.errors import ConfigError
 DEFAULT_ROOT = Path("runs")
 
 Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
+Server = Annotated[
+    str | None,
+    typer.Option("--server", metavar="URL", envvar="T6GPS_SERVER", help="A server (t6gps serve) in place of --root."),
+]
 RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[

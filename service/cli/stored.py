@@ -5,6 +5,7 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
+from dataclasses import asdict
 from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
@@ -13,17 +14,16 @@ import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
-from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName
-from t6gps.service.training import evaluation, origin, session
+from t6gps.service.cli import door
+from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, Server
+from t6gps.service.training import origin, session
+from t6gps.service.training.summary import RunSummary
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, RunError, T6GpsError
-from t6gps.storage.sql import query as sql_query
+from t6gps.storage.errors import ConfigError
 
-SUMMARY = ("run", "iterations", "cost", "forward_speed_m_per_s")
-"""What the list of runs says of each."""
 EXPORT_SECTIONS = ("robot.", "terrain.")
 
 
@@ -48,65 +48,56 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def runs(root: Root = DEFAULT_ROOT) -> None:
+def runs(root: Root = DEFAULT_ROOT, server: Server = None) -> None:
     """List the runs."""
-    if not catalog.whole(root).is_dir():
-        raise RunError(f"there is no folder {root} that could hold runs; train a first one, or give another --root")
-    rows: list[dict[str, object]] = []
-    faults = []
-    for run in catalog.list_runs(root):
-        try:
-            rows.append(_summary(run))
-        except T6GpsError as error:  # one damaged run hides none of the others
-            rows.append(dict.fromkeys(SUMMARY) | {"run": run.name, "iterations": "damaged"})
-            faults.append(str(error))
-    columns = {"run": ("run", "{}"), "iterations": ("iterations", "{}")}
-    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in SUMMARY[2:]}
-    terminal.print_rows(f"Runs in {root}", rows, columns)
-    for fault in faults:
-        typer.echo(f"damaged: {fault}")
+    with door.opened(root, server) as there:
+        summaries = there.runs()
+    columns = {"name": ("run", "{}"), "iterations": ("iterations", "{}")}
+    columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
+    rows = [asdict(run) | {"iterations": _iterations(run)} for run in summaries]
+    terminal.print_rows(f"Runs in {root}" if server is None else f"Runs of {server}", rows, columns)
+    for run in summaries:
+        if run.fault is not None:
+            typer.echo(f"damaged: {run.fault}")
 
 
-def _summary(run: Run) -> dict[str, object]:
-    """A run in a line. An error where something of it cannot be read."""
-    planned, done = origin.configured(run).run.iterations, tables.files(run)[0]
-    last = tables.read(run, "iterations").sort_by("iteration").to_pylist()[-1:]
-    known = {key: last[0][key] for key in SUMMARY[2:]} if last else dict.fromkeys(SUMMARY[2:])
-    return {"run": run.name, "iterations": f"{done} of {planned}", **known}
+def _iterations(run: RunSummary) -> str:
+    return "damaged" if run.fault is not None else f"{run.done} of {run.planned}"
 
 
-def show(run_name: RunName, root: Root = DEFAULT_ROOT) -> None:
+def show(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None) -> None:
     """Show a run: learning curve, segment classes of the last iteration, diagnosis, evaluation, files."""
-    run = catalog.open_run(root, run_name)
-    origin.configured(run)  # an error for a run that is not whole
-    if not tables.files(run)[0]:
-        typer.echo(f"run {run_name} has not finished an iteration yet")
-        return
-    print_learning(run)
-    classes = tables.read(run, "classes").to_pylist()
+    with door.opened(root, server) as there:
+        iterations = there.table(run_name, "iterations").sort_by("iteration").to_pylist()
+        if not iterations:
+            typer.echo(f"run {run_name} has not finished an iteration yet")
+            return
+        classes, result = there.table(run_name, "classes").to_pylist(), there.evaluation(run_name)
+    terminal.print_rows(f"Run {run_name}", iterations, terminal.LEARNING_COLUMNS)
     last = max((row["iteration"] for row in classes), default=-1)
     rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
     terminal.print_rows(f"Segment classes of iteration {last}", rows, terminal.CLASS_COLUMNS)
-    iterations = tables.read(run, "iterations").to_pylist()
     typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
-    result = evaluation.kept(run)
     if result:
         terminal.print_evaluation(result)
-    print_paths(run, sorted(run.figures.glob("*.png")), root)
+    if server is None:
+        run = catalog.open_run(root, run_name)
+        print_paths(run, sorted(run.figures.glob("*.png")), root)
 
 
 def query(
     run_name: RunName,
     sql: Annotated[str, typer.Argument(metavar="SQL", help="One SELECT over frames, episodes, iterations, classes.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     form: Annotated[QueryFormat, typer.Option("--format", help="How to print the result.")] = QueryFormat.TABLE,
 ) -> None:
     """Query a run's stored trajectories with SQL."""
-    run = catalog.open_run(root, run_name)
-    if form is QueryFormat.TABLE:
-        terminal.print_head(sql_query.head(run, sql))
-    else:
-        sql_query.write(run, sql, form.value, sys.stdout.buffer)
+    with door.opened(root, server) as there:
+        if form is QueryFormat.TABLE:
+            terminal.print_head(there.head(run_name, sql))
+        else:
+            there.write(run_name, sql, form.value, sys.stdout.buffer)
 
 
 def render(

@@ -11,7 +11,8 @@ import os
 import time
 import uuid
 from collections.abc import Mapping
-from typing import TypedDict
+
+from typing_extensions import TypedDict  # pydantic cannot check those of `typing` before Python 3.12
 
 from t6gps.service.pool.state import PoolState, RunState, Worker, WorkerPhase
 from t6gps.storage import catalog, durable

@@ -77,7 +77,13 @@ def _complaints(arguments: list[str]) -> list[str]:
         return []
     if name not in known:
         return [f"t6gps {name}: no such command"]
-    options = {option for parameter in known[name].params for option in parameter.opts} | {"--help"}
+    command = known[name]
+    if hasattr(command, "commands"):
+        if rest and rest[0] not in command.commands:
+            return [f"t6gps {name} {rest[0]}: no such command"]
+        if rest:
+            name, command, rest = f"{name} {rest[0]}", command.commands[rest[0]], rest[1:]
+    options = {option for parameter in command.params for option in parameter.opts} | {"--help"}
     words = [word.strip("[]") for word in rest]
     unknown = [
         f"t6gps {name} {word}: no such option"

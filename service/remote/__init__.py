@@ -1,0 +1,1 @@
+"""The other end of `service.server`: what goes over the wire, and the client."""

@@ -1,0 +1,130 @@
+"""What goes over the wire between client and server, beside the statuses and tables that everybody knows."""
+
+from __future__ import annotations
+
+from datetime import datetime
+from enum import StrEnum
+from typing import Annotated
+
+from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, WithJsonSchema
+
+from t6gps.service.config import WORKERS_MOST_N, presets
+from t6gps.storage.catalog import NAME_LENGTH_N
+from t6gps.storage.sql.query import SQL_BYTES_N
+
+WAIT_S = 60.0
+"""The longest that a request may wait for its effect."""
+LIFETIME_DAYS_MOST = 366.0
+
+RunName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]*$")]
+Preset = Annotated[str, WithJsonSchema({"type": "string", "enum": presets()})]
+Key = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z_]+(\.[a-z_]+)+$")]
+Number = Annotated[float, Field(allow_inf_nan=False)]
+Text = Annotated[str, StringConstraints(max_length=200)]
+Scalar = bool | int | Number | Text
+
+
+class Scope(StrEnum):
+    """What a token allows. Each scope includes those before it."""
+
+    READ = "read"
+    OPERATE = "operate"
+    ADMIN = "admin"
+
+    def includes(self, other: Scope) -> bool:
+        """True when a token of this scope may do what needs the other."""
+        order = list(Scope)
+        return order.index(self) >= order.index(other)
+
+
+class Message(BaseModel):
+    """Frozen, strict, and without unknown keys."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid", strict=True)
+
+
+class Refusal(Message):
+    """Why a request was refused: a sentence, and the class of `storage.errors` that it belongs to."""
+
+    error: str
+    kind: str
+
+
+class Health(Message):
+    """The server is alive; its version."""
+
+    version: str
+
+
+class StartRequest(Message):
+    """A run to start: a preset, the run's name (by default the preset's), settings by dotted keys."""
+
+    preset: Preset
+    name: RunName | None = None
+    settings: dict[Key, Scalar | list[Scalar]] = Field(default={}, max_length=100)
+
+
+class Started(Message):
+    """The run that a process works on now."""
+
+    name: str
+    pid: int
+
+
+class ScaleRequest(Message):
+    """Workers from now on, and how long to wait for them (s)."""
+
+    workers: int = Field(ge=0, le=WORKERS_MOST_N)
+    deadline_s: Number = Field(30.0, ge=0.0, le=WAIT_S)
+
+
+class QueryForm(StrEnum):
+    """Forms of a query's result; a head is the first rows as texts for people."""
+
+    ARROW = "arrow"
+    CSV = "csv"
+    JSON = "json"
+    HEAD = "head"
+
+
+class QueryRequest(Message):
+    """One SELECT, and the form of its result."""
+
+    sql: Annotated[str, StringConstraints(max_length=SQL_BYTES_N)]
+    form: Annotated[QueryForm, Field(strict=False)] = QueryForm.ARROW
+
+
+class TokenRequest(Message):
+    """A token to issue."""
+
+    name: TokenName
+    scope: Annotated[Scope, Field(strict=False)]
+    days: Number = Field(gt=0.0, le=LIFETIME_DAYS_MOST)
+
+
+class TokenLine(BaseModel):
+    """What may be known of a token."""
+
+    name: str
+    scope: Scope
+    created: datetime
+    expires: datetime
+
+
+class IssuedToken(TokenLine):
+    """A new token, and its text, which is nowhere kept."""
+
+    token: str
+
+
+class AuditLine(BaseModel):
+    """A change that somebody asked for: when (UTC), who, from where, what, and the status that answered it."""
+
+    time: datetime
+    token: str
+    address: str
+    method: str
+    path: str
+    details: dict[str, JsonValue]
+    status: int

@@ -1,0 +1,131 @@
+"""What routes ask for: the place that they serve, a scope, a run by its name, and a slot for heavy work."""
+
+from __future__ import annotations
+
+import threading
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from http import HTTPStatus
+from pathlib import Path as Folder
+from typing import Annotated, TypeAlias, cast, final
+
+from fastapi import Depends, HTTPException, Path, Request
+from fastapi.security import HTTPBearer
+from pydantic import JsonValue
+
+from t6gps.service.remote.messages import Refusal, RunName, Scope
+from t6gps.service.server import audit
+from t6gps.service.server.jobs import Launch
+from t6gps.storage import catalog
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
+
+READING_N, OPERATING_N, STREAMS_N = 2, 8, 64
+"""How much may be under way at once: queries and the like, changes that wait for their effect, streams of events."""
+Answers: TypeAlias = dict[int | str, dict[str, object]]
+REFUSED = (
+    HTTPStatus.BAD_REQUEST,
+    HTTPStatus.UNAUTHORIZED,
+    HTTPStatus.FORBIDDEN,
+    HTTPStatus.NOT_FOUND,
+    HTTPStatus.REQUEST_TIMEOUT,
+    HTTPStatus.CONFLICT,
+    HTTPStatus.REQUEST_ENTITY_TOO_LARGE,
+    HTTPStatus.UNPROCESSABLE_ENTITY,
+    HTTPStatus.TOO_MANY_REQUESTS,
+    HTTPStatus.SERVICE_UNAVAILABLE,
+)
+REFUSALS: Answers = {int(status): {"model": Refusal, "description": status.phrase} for status in REFUSED}
+"""How any route may refuse."""
+
+
+class NoSuchRunError(RunError):
+    """A run that is not there."""
+
+
+@final
+class Slots:
+    """Room for so much at once. Who finds none is told to come back, and nobody queues."""
+
+    def __init__(self, most_n: int) -> None:
+        self._free = threading.Semaphore(most_n)
+
+    def take(self) -> None:
+        """Take a slot. HTTPException where there is none."""
+        if not self._free.acquire(blocking=False):
+            sentence = "the server is busy with other requests of this kind; ask again in a second"
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, sentence, {"Retry-After": "1"})
+
+    def give_back(self) -> None:
+        """Give it back."""
+        self._free.release()
+
+    @contextmanager
+    def taken(self) -> Iterator[None]:
+        """Hold a slot meanwhile."""
+        self.take()
+        try:
+            yield
+        finally:
+            self.give_back()
+
+
+@dataclass(frozen=True)
+class Served:
+    """What a server serves: a root, what starts the process of a run, and room for heavy work."""
+
+    root: Folder
+    launch: Launch
+    reading: Slots = field(default_factory=lambda: Slots(READING_N))
+    operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
+    streams: Slots = field(default_factory=lambda: Slots(STREAMS_N))
+
+
+def _served(request: Request) -> Served:
+    return cast(Served, request.app.state.served)
+
+
+Place = Annotated[Served, Depends(_served)]
+_bearer = HTTPBearer(auto_error=False, description="A token of `t6gps token create`, with scope and expiry.")
+
+
+def _check(request: Request, scope: Scope) -> None:
+    token = request.state.token
+    if not token.scope.includes(scope):
+        sentence = f"token {token.name!r} has scope {token.scope}, this needs {scope}; ask for another token"
+        raise HTTPException(HTTPStatus.FORBIDDEN, sentence)
+
+
+def _asking(scope: Scope) -> Callable[..., None]:
+    def check(request: Request, _: Annotated[object, Depends(_bearer)]) -> None:
+        _check(request, scope)
+
+    return check
+
+
+def _changing(scope: Scope) -> Callable[..., dict[str, JsonValue]]:
+    def note(request: Request, place: Place, _: Annotated[object, Depends(_bearer)]) -> dict[str, JsonValue]:
+        audit.prepare(place.root)
+        request.state.change = {}
+        _check(request, scope)
+        return cast("dict[str, JsonValue]", request.state.change)
+
+    return note
+
+
+Reading, Administering = Depends(_asking(Scope.READ)), Depends(_asking(Scope.ADMIN))
+"""Of routes that change nothing."""
+Operation = Annotated[dict[str, JsonValue], Depends(_changing(Scope.OPERATE))]
+Administration = Annotated[dict[str, JsonValue], Depends(_changing(Scope.ADMIN))]
+"""Of a route that changes something: what the audit shall say of it, beside who and when."""
+
+
+def _named(place: Place, name: Annotated[RunName, Path(description="Name of a run.")]) -> Run:
+    try:
+        return catalog.open_run(place.root, name)
+    except RunError as error:
+        raise NoSuchRunError(*error.args) from None
+
+
+NamedRun = Annotated[Run, Depends(_named)]

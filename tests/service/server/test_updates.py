@@ -1,0 +1,115 @@
+"""Laws of live updates: each iteration comes once, also to who was cut off, and dead listeners hold up nobody."""
+
+from __future__ import annotations
+
+import socket
+from collections.abc import Callable
+from itertools import islice
+from pathlib import Path
+from urllib.parse import urlsplit
+
+import pytest
+from loopback import Server, commit
+
+from t6gps.service.remote.messages import Scope
+from t6gps.service.remote.stream import Update, parsed
+from t6gps.service.server.access import STREAMS_N
+from t6gps.storage.errors import RunError, ServerError
+from t6gps.storage.records import Episode
+
+
+def ids(updates: list[Update]) -> list[int | None]:
+    return [update.id for update in updates]
+
+
+def test_who_was_cut_off_goes_on_after_the_last_id_and_hears_each_iteration_once(
+    server: Server, make_episode: Callable[..., Episode]
+) -> None:
+    with server.client(Scope.READ) as client:
+        (first,) = islice(client.events("walk"), 1)
+        stream = client.events("walk", int(first.id or 0))
+        heard = [first, next(stream)]
+        commit(server.run, 2, make_episode)
+        heard.append(next(stream))
+        stream.close()
+        commit(server.run, 3, make_episode)
+        heard += islice(client.events("walk", int(heard[-1].id or 0)), 1)
+    assert ids(heard) == [0, 1, 2, 3]
+    assert [update.data["cost"] for update in heard] == [0.5, 1.5, 2.5, 3.5]
+
+
+def test_a_stream_of_a_run_that_does_not_exist_is_refused(server: Server) -> None:
+    with server.client(Scope.READ) as client, pytest.raises(RunError, match="no run 'none'"):
+        next(client.events("none"))
+
+
+@pytest.mark.parametrize("last", ["-2", "x", "1e3", "9" * 30])
+def test_an_id_that_was_never_given_is_refused(server: Server, last: str) -> None:
+    with server.http(Scope.READ) as http:
+        assert http.get("/v1/runs/walk/events", headers={"Last-Event-ID": last}).status_code == 422
+
+
+def listener(server: Server, path: str) -> socket.socket:
+    """A client that asks and takes nothing of the answer."""
+    place = urlsplit(server.url)
+    asking = socket.socket()
+    asking.setsockopt(socket.SOL_SOCKET, socket.SO_RCVBUF, 1024)
+    asking.connect((place.hostname, place.port))
+    head = f"GET {path} HTTP/1.1\r\nHost: {place.netloc}\r\nAuthorization: Bearer {server.tokens[Scope.READ]}\r\n\r\n"
+    asking.sendall(head.encode())
+    return asking
+
+
+def test_listeners_that_take_nothing_or_are_dead_hold_up_nobody(
+    server: Server, wait_until: Callable[..., None]
+) -> None:
+    alive = [listener(server, "/v1/runs/walk/events") for _ in range(10)]
+    with server.client(Scope.READ) as client:
+        for _ in range(STREAMS_N):
+            dead = listener(server, "/v1/runs/walk/events")
+            assert dead.recv(12) in (b"HTTP/1.1 200", b"HTTP/1.1 503")
+            dead.close()
+            assert client.versions("walk") == []
+
+        def heard() -> bool:
+            try:
+                return next(client.events("walk")).id == 0
+            except ServerError:  # all slots are taken until those that went are noticed
+                return False
+
+        wait_until(heard, 60)
+    for asking in alive:
+        asking.close()
+
+
+def test_a_client_that_takes_nothing_is_dropped(serve: Callable[..., Server], wait_until: Callable[..., None]) -> None:
+    server = serve(stalled_s=0.5)
+    (server.run.figures / "large.png").write_bytes(b"\0" * 2**25)
+    slow = listener(server, "/v1/runs/walk/figures/large.png")
+    assert slow.recv(12) == b"HTTP/1.1 200"
+    ports = urlsplit(server.url).port, slow.getsockname()[1]
+    assert connected(*ports)
+    wait_until(lambda: not connected(*ports), 60)
+    slow.close()
+
+
+def connected(port: int, other: int) -> bool:
+    """True while the kernel holds a connection from `port` of this machine to `other`."""
+    lines = [line.split() for line in Path("/proc/net/tcp").read_text(encoding="ascii").splitlines()[1:]]
+    return (port, other) in {tuple(int(end.rpartition(":")[2], 16) for end in line[1:3]) for line in lines}
+
+
+def test_events_are_read_as_they_were_written() -> None:
+    lines = [
+        ": alive",
+        "",
+        "event: status",
+        'data: {"state": 1}',
+        "",
+        "event: iteration",
+        "id: 7",
+        "data: {}",
+        "",
+    ]
+    assert list(parsed(lines)) == [Update("status", {"state": 1}), Update("iteration", {}, 7)]
+    assert not list(parsed(["event: status", "data: {}"])), "an event that was cut off is none"
