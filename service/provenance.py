@@ -11,6 +11,11 @@ from datetime import UTC, datetime
 from importlib import metadata, util
 from pathlib import Path
 
+from t6gps.storage.schema import SCHEMA_VERSION
+
+SHORT_N = 12
+"""Digits of a digest that tell two apart in a message."""
+
 PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "torch", "ray")
 """Those on which the data of a run depend."""
 
@@ -62,6 +67,12 @@ def compiled() -> dict[str, str]:
     """SHA-256 of those of COMPILED that are built, by name."""
     specs = {name: util.find_spec(f"t6gps.{name}") for name in COMPILED}
     return {name: sha256(Path(spec.origin).read_bytes()) for name, spec in specs.items() if spec and spec.origin}
+
+
+def build() -> dict[str, str]:
+    """What data depend on in this installation, beside the settings: versions, digests and the schema, by names."""
+    digests = {f"compiled {name}": digest[:SHORT_N] for name, digest in compiled().items()}
+    return {**versions(), "schema": str(SCHEMA_VERSION), **digests}
 
 
 def sha256(content: bytes) -> str:

@@ -1,4 +1,4 @@
-"""The commands for a run that is running, and for what it had to set aside: `scale`, `status`, `replay`."""
+"""The commands for a run that is running, and for what it had to set aside: `scale`, `stop`, `status`, `replay`."""
 
 from __future__ import annotations
 
@@ -10,12 +10,17 @@ from typing import Annotated
 import typer
 
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
-from t6gps.service.pool import control, crash_bundle
+from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.attempt import Failure
+from t6gps.service.steering import events as happened
+from t6gps.service.steering import requests
+from t6gps.service.steering import status as statuses
+from t6gps.service.steering.status import Status
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 
+Deadline = Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for that (s).")]
 WORKER_COLUMNS = {
     "slot": ("slot", "{:d}"),
     "incarnation": ("incarnation", "{:d}"),
@@ -30,7 +35,7 @@ WORKER_COLUMNS = {
 def add_to(app: typer.Typer) -> None:
     """Make the commands part of `t6gps`."""
     app.command(context_settings={"ignore_unknown_options": True})(scale)  # so that -1 is a number, and refused as one
-    for command in (status, replay):
+    for command in (pause, unpause, stop, status, events, replay):
         app.command()(command)
 
 
@@ -38,18 +43,35 @@ def scale(
     run_name: RunName,
     workers: Annotated[int, typer.Argument(metavar="N", help="Workers from now on; 0 pauses the run.")],
     root: Root = DEFAULT_ROOT,
-    deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for them (s).")] = (
-        control.SCALE_DEADLINE_S
-    ),
+    deadline_s: Deadline = requests.SCALE_DEADLINE_S,
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
-    reached = control.scale(catalog.open_run(root, run_name), workers, deadline_s)
+    _tell_reached(run_name, requests.scale(catalog.open_run(root, run_name), workers, deadline_s))
+
+
+def pause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+    """Give a running run no workers for now; `unpause` gives it what it had."""
+    _tell_reached(run_name, requests.pause(catalog.open_run(root, run_name), deadline_s))
+
+
+def unpause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+    """Give a paused run the workers, or the autoscaling, that it had."""
+    _tell_reached(run_name, requests.unpause(catalog.open_run(root, run_name), deadline_s))
+
+
+def stop(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.STOP_DEADLINE_S) -> None:
+    """Stop a running run as Ctrl-C does, and wait until it has ended; `train --resume` continues it."""
+    state = requests.stop(catalog.open_run(root, run_name), deadline_s)
+    typer.echo(f"run {run_name}: {state}")
+
+
+def _tell_reached(run_name: str, reached: Status) -> None:
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
 def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    state = control.status(catalog.open_run(root, run_name))
+    state = statuses.status(catalog.open_run(root, run_name))
     if as_json:
         typer.echo(json.dumps(state))
         return
@@ -67,6 +89,14 @@ def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) 
     typer.echo("\n".join(lines))
     if state["workers"]:
         terminal.print_rows("Workers", [dict(worker) for worker in state["workers"]], WORKER_COLUMNS)
+
+
+def events(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+    """Say what happened to a run: starts, scaling, failures, replacements, each with its reason."""
+    found = happened.read(catalog.open_run(root, run_name))
+    for event in found:
+        line = f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}"
+        typer.echo(json.dumps(event) if as_json else line)
 
 
 def replay(

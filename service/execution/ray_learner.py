@@ -22,8 +22,8 @@ from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.rows import AnyArray
 from t6gps.service import threads
 from t6gps.service.config import Config
-from t6gps.service.pool import control
 from t6gps.service.pool.deadlines import Timings
+from t6gps.service.pool.pool import TICK_S
 from t6gps.service.ray_backend import processes, pulse
 from t6gps.service.ray_backend.cluster import Reference, start_actor
 from t6gps.service.ray_backend.pulse import Pulse, Watch
@@ -73,7 +73,7 @@ class LearnerActor:
         """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""
         told_s = -math.inf
         for done, total in getattr(self._learner, phase.name)():
-            if done == total or time.monotonic() - told_s >= control.TICK_S:
+            if done == total or time.monotonic() - told_s >= TICK_S:
                 told_s = time.monotonic()
                 yield done, total
 

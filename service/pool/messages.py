@@ -117,9 +117,14 @@ class Capacity:
 
 @dataclass(frozen=True)
 class ScaleRequested:
-    """Somebody asks for another number of workers."""
+    """Somebody asks for another number of workers; none is a pause."""
 
     workers: int
+
+
+@dataclass(frozen=True)
+class UnpauseRequested:
+    """Somebody asks for what there was before the pause."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,19 @@ class Paused:
 
 
 Observation = (
-    Opened | Ready | Alive | Sampled | Failed | Unserved | Died | Ended | Durable | Capacity | ScaleRequested | Paused
+    Opened
+    | Ready
+    | Alive
+    | Sampled
+    | Failed
+    | Unserved
+    | Died
+    | Ended
+    | Durable
+    | Capacity
+    | ScaleRequested
+    | UnpauseRequested
+    | Paused
 )
 
 

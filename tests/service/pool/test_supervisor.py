@@ -17,6 +17,7 @@ from t6gps.service.pool.state import (
     WorkerPhase,
 )
 from t6gps.service.pool.supervisor import GRACE_S
+from t6gps.service.steering import status
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import EpisodePlan
 
@@ -196,9 +197,9 @@ def test_an_episode_that_always_raises_is_quarantined_after_three_failures_and_t
     house.paper.raising.add(5)
     assert sorted(house.sample()) == [n for n in range(12) if n != 5]
     assert [plan.episode_id for plan in house.quarantined] == [5]
-    status = house.pool.status()
-    assert status["quarantined"] == [5]
-    assert status["episodes"]["failures"] == 3
+    found = status.describe(house.pool.situation())
+    assert found["quarantined"] == [5]
+    assert found["episodes"]["failures"] == 3
 
 
 def test_an_episode_that_kills_its_worker_three_times_is_quarantined() -> None:
@@ -225,7 +226,8 @@ def test_scaling_reaches_what_was_asked_while_sampling_and_loses_nothing() -> No
     def scale(_: list[int]) -> None:
         nonlocal asked_s
         if not asked_s:
-            house.requests.asked, asked_s = requests_left[0], house.paper.now_s
+            house.scale(requests_left[0])
+            asked_s = house.paper.now_s
         assert house.paper.now_s - asked_s <= 5
         if house.ready == requests_left[0] == len(house.pool.state.workers) and len(requests_left) > 1:
             requests_left.pop(0)
@@ -243,7 +245,7 @@ def test_a_draining_worker_finishes_its_episode_and_hands_the_other_back() -> No
     house = House(2, 10)
     house.until(lambda: all(len(w.plans) == 2 for w in house.pool.state.workers.values()) and house.ready == 2, 5)
     kept, given = house.pool.state.workers[1].plans
-    house.requests.asked = 1
+    house.scale(1)
     house.pool.tick()
     assert house.pool.state.workers[1].phase == WorkerPhase.DRAINING
     assert list(house.pool.state.workers[1].plans) == [kept]
@@ -258,10 +260,10 @@ def test_scaled_to_nothing_a_run_pauses_and_goes_on_when_it_is_scaled_up() -> No
 
     def pause(found: list[int]) -> None:
         if len(found) == 1:
-            house.requests.asked = 0
+            house.scale(0)
             house.until(lambda: not house.pool.state.workers, 5)
             assert house.pool.state.condition == "PAUSED"
-            house.requests.asked = 1
+            house.scale(1)
 
     assert sorted(house.sample(pause)) == list(range(10))
 
@@ -270,7 +272,7 @@ def test_a_worker_that_waits_for_a_cpu_is_named_and_comes_when_there_is_one() ->
     house = House(1, 0)
     house.paper.room = 1
     house.until(lambda: house.ready == 1, 5)
-    house.requests.asked = 2
+    house.scale(2)
     house.run(5)
     assert house.pool.state.condition == "DEGRADED"
     assert "1 wait for a CPU" in house.pool.state.reason
