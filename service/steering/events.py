@@ -7,6 +7,7 @@ LARGEST_BYTES is renamed to `events.1.jsonl`, and a new one begins.
 from __future__ import annotations
 
 import json
+import os
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -121,7 +122,7 @@ def _scaled(before: Standing, state: PoolState, observed: Sequence[Observation])
             by = "asked for" if observation.workers else "a pause was asked for"
         elif isinstance(observation, messages.UnpauseRequested):
             by = "the end of the pause was asked for"
-    yield Happened(EventKind.SCALE, f"from {before.wanted} to {state.wanted} workers: {by}")
+    yield Happened(EventKind.SCALE, f"workers, from {before.wanted} to {state.wanted}: {by}")
 
 
 def _done(state: PoolState, instruction: Instruction) -> Iterator[Happened]:
@@ -148,9 +149,8 @@ def _started(state: PoolState, decided: Sequence[Instruction]) -> Iterator[Happe
         if isinstance(each, messages.Start) and not state.slots[each.worker.slot].trouble
     ]
     if slots:
-        yield Happened(
-            EventKind.START, f"{len(slots)} workers, slots {min(slots)} to {max(slots)}: {state.wanted} are wanted"
-        )
+        where = f"slot {slots[0]}" if len(slots) == 1 else f"{len(slots)} slots from {min(slots)} to {max(slots)}"
+        yield Happened(EventKind.START, f"{where}: {state.wanted} wanted")
 
 
 def _turned(before: Standing, after: Standing, state: PoolState) -> Iterator[Happened]:
@@ -167,6 +167,8 @@ class EventLog:
     def __init__(self, folder: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         folder.mkdir(exist_ok=True)
         self._path, self._largest_bytes = folder / "events.jsonl", largest_bytes
+        if self._path.exists():  # perhaps the machine went down in the middle of a line
+            os.truncate(self._path, self._path.read_bytes().rfind(b"\n") + 1)
 
     def write(self, happened: Sequence[Happened], phase: str) -> None:
         """Add events that happened now. They need not survive a crash of the machine."""

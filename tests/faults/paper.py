@@ -11,7 +11,7 @@ from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.decision_log import DecisionLog
 from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.messages import Alive, Died, Instruction, Observation, PostMortem, Ready, ScaleRequested
-from t6gps.service.pool.outside import Nobody, Situation
+from t6gps.service.pool.outside import Nobody, Outside, Situation
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
 from t6gps.service.pool.state import (
@@ -55,7 +55,7 @@ class Paper(Transport):
         self.reports: list[Report] = []
         self.fails_to_start = False
         self.hold_back = False
-        self.settings = SETTINGS
+        self.settings, self.build = SETTINGS, dict[str, str]()
         self.digest = "policy"
         self.episode_s = EPISODE_S
         self.raising: set[int] = set()
@@ -97,7 +97,9 @@ class Paper(Transport):
                     self.die(worker)
                     continue
                 paper.ready = True
-                self.reports.append(Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings)))
+                self.reports.append(
+                    Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings, self.build))
+                )
             while paper.queue and self.now_s >= paper.until_s:
                 if paper.queue[0].episode_id in self.hanging:
                     break
@@ -162,12 +164,13 @@ class House:
         autoscale: tuple[int, int] | None = None,
         bytes_in_flight: int = 2**30,
         log: DecisionLog | None = None,
+        outside: Outside | None = None,
     ) -> None:
         self.paper, self.ledger, self.asker = Paper(), Ledger(), Asker()
         self.quarantined: list[EpisodePlan] = []
         times = EpisodeTimes(SHORTEST_S)
         state = PoolState(wanted, SETTINGS, self.ledger, TIMINGS, times, autoscale, bytes_in_flight=bytes_in_flight)
-        self.pool = Pool(state, self.paper, self.asker, self.quarantined.append, log, self.paper.clock)
+        self.pool = Pool(state, self.paper, outside or self.asker, self.quarantined.append, log, self.paper.clock)
         self.pool.open(plans(episodes), [], {0: "policy"})
 
     def run(self, seconds: float) -> None:

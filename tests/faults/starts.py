@@ -2,7 +2,8 @@
 
     python tests/faults/starts.py [--json] [PATTERN]
 
-Starts a small training under each condition whose name holds PATTERN, and stops one by SIGTERM in each of its phases.
+Starts a small training under each condition whose name holds PATTERN. Stops one in each of its phases, by SIGTERM and
+by `t6gps stop`.
 Prints what came of it and how long it took; with --json as docs/figures/starts.json has it. Conditions that this
 machine cannot make are passed over with a word. `test_starts.py` runs some of them.
 """
@@ -23,10 +24,14 @@ from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from datetime import date
+from itertools import product
 from pathlib import Path
 
 from t6gps.service import provenance
 from t6gps.service.ray_backend import processes
+from t6gps.service.steering import requests
+from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
 
 DEADLINE_S, STOP_DEADLINE_S, GONE_DEADLINE_S = 60.0, 5.0, 10.0
 """For a refusal; for a stop; for the last process of a run that has ended."""
@@ -250,9 +255,24 @@ PHASES: dict[str, Callable[[str, Path], bool]] = {
 }
 
 
-def stop(phase: str, folder: Path) -> Outcome:
+def by_request(process: subprocess.Popen[bytes], run: Path) -> None:
+    """Stop as `t6gps stop` does. A run that has ended by itself cannot be stopped."""
+    try:
+        requests.stop(catalog.Run(run))
+    except RunError as error:
+        if "is not running" not in str(error):
+            raise
+
+
+WAYS: dict[str, Callable[[subprocess.Popen[bytes], Path], None]] = {
+    "SIGTERM": lambda process, _: process.send_signal(signal.SIGTERM),
+    "t6gps stop": by_request,
+}
+
+
+def stop(way: str, phase: str, folder: Path) -> Outcome:
     """Stop a training in a phase, and judge how it ends."""
-    condition, name = Condition(phase), f"SIGTERM {phase}"
+    condition, name = Condition(phase), f"{way} {phase}"
     with launched(condition, folder) as (process, mark):
         deadline = time.monotonic() + PATIENCE_S
         while not PHASES[phase](mark, folder / "runs" / "one"):
@@ -260,7 +280,7 @@ def stop(phase: str, folder: Path) -> Outcome:
                 return Outcome(name, "", 0.0, "the phase never came: " + (folder / "said").read_text()[-1500:])
             time.sleep(0.005)
         sent_s = time.monotonic()
-        process.send_signal(signal.SIGTERM)
+        WAYS[way](process, folder / "runs" / "one")
         try:
             code = process.wait(DEADLINE_S)
         except subprocess.TimeoutExpired:
@@ -281,9 +301,9 @@ def outcomes(pattern: str) -> Iterator[Outcome]:
             print(f"{condition.name}: this machine cannot make it ({condition.needs})", file=sys.stderr)
             continue
         yield in_folder(lambda folder, condition=condition: start(condition, folder))
-    for phase in PHASES:
-        if pattern in phase:
-            yield in_folder(lambda folder, phase=phase: stop(phase, folder))
+    for way, phase in product(WAYS, PHASES):
+        if pattern in f"{way} {phase}":
+            yield in_folder(lambda folder, way=way, phase=phase: stop(way, phase, folder))
 
 
 def in_folder(judge: Callable[[Path], Outcome]) -> Outcome:

@@ -297,10 +297,16 @@ def test_autoscaling_follows_the_backlog_and_the_room() -> None:
     assert house.ready == 1
 
 
-def test_a_worker_with_other_settings_or_another_policy_ends_the_run() -> None:
+def test_a_worker_with_other_settings_another_installation_or_another_policy_ends_the_run() -> None:
     house = House(1, 3)
     house.paper.settings = "others"
     with pytest.raises(RunError, match="other settings"):
+        house.run(5)
+    house = House(1, 3)
+    house.pool.state.build = {"t6gps": "0.3", "schema": "5", "compiled learner._backward": "aa"}
+    house.paper.build = {"t6gps": "0.3", "schema": "4"}
+    differences = r"schema 4 \(the run: 5\), compiled learner._backward none \(the run: aa\)"
+    with pytest.raises(RunError, match=rf"on node paper has another installation than the run: {differences}; install"):
         house.run(5)
     house = House(1, 3)
     house.paper.digest = "another"
