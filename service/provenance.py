@@ -6,6 +6,7 @@ import hashlib
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata, util
@@ -73,6 +74,15 @@ def build() -> dict[str, str]:
     """What data depend on in this installation, beside the settings: versions, digests and the schema, by names."""
     digests = {f"compiled {name}": digest[:SHORT_N] for name, digest in compiled().items()}
     return {**versions(), "schema": str(SCHEMA_VERSION), **digests}
+
+
+def differences(found: Mapping[str, str], here: Mapping[str, str]) -> str:
+    """In what one `build` is another than the run's, with both values; empty where they are alike."""
+    return ", ".join(
+        f"{name} {found.get(name, 'none')} (the run: {here.get(name, 'none')})"
+        for name in {**here, **found}
+        if found.get(name) != here.get(name)
+    )
 
 
 def sha256(content: bytes) -> str:

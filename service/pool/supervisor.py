@@ -11,6 +11,7 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 
+from t6gps.service import provenance
 from t6gps.service.pool import messages, scaling
 from t6gps.service.pool.attempt import Failure, FailureKind
 from t6gps.service.pool.messages import Instruction, Observation
@@ -103,14 +104,9 @@ def _on_report(state: PoolState, worker: Worker, report: Observation, now: float
 
 def _unlike(state: PoolState, found: Identity) -> str:
     """What a worker has otherwise than the run, in words; empty where it has nothing."""
-    there, here = found.build, state.build
-    others = [
-        f"{name} {there.get(name, 'none')} (the run: {here.get(name, 'none')})"
-        for name in {**here, **there}
-        if there.get(name) != here.get(name)
-    ]
+    others = provenance.differences(found.build, state.build)
     if others:
-        return f"has another installation than the run: {', '.join(others)}; install the same on every node"
+        return f"has another installation than the run: {others}; install the same on every node"
     if found.settings_digest != state.settings_digest:
         return "has other settings than the run; install the same version on every node"
     return ""

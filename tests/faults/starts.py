@@ -31,7 +31,6 @@ from t6gps.service import provenance
 from t6gps.service.ray_backend import processes
 from t6gps.service.steering import requests
 from t6gps.storage import catalog
-from t6gps.storage.errors import RunError
 
 DEADLINE_S, STOP_DEADLINE_S, GONE_DEADLINE_S = 60.0, 5.0, 10.0
 """For a refusal; for a stop; for the last process of a run that has ended."""
@@ -244,6 +243,8 @@ def has_process(name: str) -> Callable[[str, Path], bool]:
     return lambda mark, _: any(name in processes.command(pid) for pid in marked(mark))
 
 
+CLOSING = "while it closes and draws"
+"""The run is done, and only its process is not: there is nothing left for `t6gps stop`."""
 PHASES: dict[str, Callable[[str, Path], bool]] = {
     "while Ray starts": has_process("gcs_server"),
     "while the policy server and the workers start": has_process("ray::"),
@@ -251,22 +252,13 @@ PHASES: dict[str, Callable[[str, Path], bool]] = {
     "while episodes are sampled": lambda _, run: any(run.glob("spool/*/episode-*")),
     "while the learner works": lambda _, run: any(run.glob("checkpoints/*1*")),
     "during the evaluation": lambda _, run: any(run.glob("checkpoints/*2*")),
-    "while it closes and draws": lambda _, run: (run / "evaluation.json").exists(),
+    CLOSING: lambda _, run: (run / "evaluation.json").exists(),
 }
 
 
-def by_request(process: subprocess.Popen[bytes], run: Path) -> None:
-    """Stop as `t6gps stop` does. A run that has ended by itself cannot be stopped."""
-    try:
-        requests.stop(catalog.Run(run))
-    except RunError as error:
-        if "is not running" not in str(error):
-            raise
-
-
-WAYS: dict[str, Callable[[subprocess.Popen[bytes], Path], None]] = {
+WAYS: dict[str, Callable[[subprocess.Popen[bytes], Path], object]] = {
     "SIGTERM": lambda process, _: process.send_signal(signal.SIGTERM),
-    "t6gps stop": by_request,
+    "t6gps stop": lambda _, run: requests.stop(catalog.Run(run)),
 }
 
 
@@ -302,7 +294,7 @@ def outcomes(pattern: str) -> Iterator[Outcome]:
             continue
         yield in_folder(lambda folder, condition=condition: start(condition, folder))
     for way, phase in product(WAYS, PHASES):
-        if pattern in f"{way} {phase}":
+        if pattern in f"{way} {phase}" and (way, phase) != ("t6gps stop", CLOSING):
             yield in_folder(lambda folder, way=way, phase=phase: stop(way, phase, folder))
 
 
