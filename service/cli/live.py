@@ -94,9 +94,11 @@ def status(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) 
 def events(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
     """Say what happened to a run: starts, scaling, failures, replacements, each with its reason."""
     found = happened.read(catalog.open_run(root, run_name))
+    if as_json:
+        typer.echo(json.dumps({"events": found}))
+        return
     for event in found:
-        line = f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}"
-        typer.echo(json.dumps(event) if as_json else line)
+        typer.echo(f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}")
 
 
 def replay(
