@@ -187,6 +187,13 @@ class AskCapacity:
 
 
 @dataclass(frozen=True)
+class AskNodes:
+    """Let the cluster have room for so many workers, where it can grow; none is the end of that."""
+
+    workers: int
+
+
+@dataclass(frozen=True)
 class Accept:
     """Hand an episode that came back to the run; a `Durable` follows. Others that came back are dropped."""
 
@@ -209,4 +216,4 @@ class Publish:
     reason: str
 
 
-Instruction = Start | Send | Ping | End | AskCapacity | Accept | Quarantine | Publish
+Instruction = Start | Send | Ping | End | AskCapacity | AskNodes | Accept | Quarantine | Publish

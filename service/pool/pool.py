@@ -159,6 +159,8 @@ class Pool:
             case messages.AskCapacity():
                 waiting = tuple(worker for worker in instruction.starting if not self._transport.placed(worker))
                 self._unseen.append(messages.Capacity(self._transport.free_workers(), waiting))
+            case messages.AskNodes():
+                self._transport.ask_nodes(instruction.workers)
             case messages.Accept():
                 episode = self._came.pop((instruction.worker, instruction.episode_id))
                 self._accepted.append((instruction.episode_id, episode))

@@ -180,6 +180,7 @@ class PoolState:
     failed_starts_n    starts in a row that failed
     last_trouble       the newest failure, in words
     free_n, asked_s    room for more workers, and when the cluster was asked
+    asked_n            workers that the cluster was last asked to have room for
     needed_s           when autoscaling last needed as many workers as there are
     judges_from_s      when deadlines count again
     """
@@ -203,6 +204,7 @@ class PoolState:
     last_trouble: str = ""
     free_n: int = 0
     asked_s: float | None = None
+    asked_n: int = 0
     needed_s: float | None = None
     judges_from_s: float | None = None
     counters: dict[str, int] = field(

@@ -34,6 +34,7 @@ def decide(state: PoolState, observed: Sequence[Observation], now: float) -> lis
     instructions = [instruction for observation in observed for instruction in _observe(state, observation, now)]
     instructions += scaling.ask_capacity(state, now)
     scaling.autoscale(state, now)
+    instructions += scaling.ask_nodes(state)
     for step in (_end_overdue, _drain, _fill, _send):
         instructions += step(state, now)
     before = state.condition, state.reason

@@ -62,6 +62,7 @@ class Paper(Transport):
         self.hanging: set[int] = set()
         self.crashing: set[int] = set()
         self.silent: set[WorkerId] = set()
+        self.nodes_asked: list[int] = []
         self.most_in_flight = 0
         self.polls_n = 0
 
@@ -126,6 +127,9 @@ class Paper(Transport):
 
     def placed(self, worker: WorkerId) -> bool:
         return list(self.alive).index(worker) < self.room
+
+    def ask_nodes(self, workers: int) -> None:
+        self.nodes_asked.append(workers)
 
     def free_workers(self) -> int:
         return max(self.room - len(self.alive), 0)

@@ -26,7 +26,5 @@ def test_events_are_lines_for_people_and_an_object_for_programs(tmp_path: Path) 
         ["hang", "sampling:", "no", "result"],
         ["start", "sampling:", "again"],
     ]
-    objects = [
-        json.loads(line) for line in t6gps("events", "eventful", "--root", tmp_path, "--json").stdout.splitlines()
-    ]
-    assert [each["event"] for each in objects] == ["hang", "start"]
+    told = json.loads(t6gps("events", "eventful", "--root", tmp_path, "--json").stdout)
+    assert [event["event"] for event in told["events"]] == ["hang", "start"]

@@ -297,6 +297,26 @@ def test_autoscaling_follows_the_backlog_and_the_room() -> None:
     assert house.ready == 1
 
 
+def test_autoscaling_asks_for_the_room_that_it_lacks_and_gives_it_back() -> None:
+    house = House(1, 40, autoscale=(1, 4))
+    house.paper.room = 1
+
+    def watch(found: list[int]) -> None:
+        if len(found) == 1:
+            assert house.paper.nodes_asked == [4]
+            assert house.ready == 1
+            house.paper.room = 4  # the cluster has grown
+            house.until(lambda: house.ready == 4, 5)
+
+    house.sample(watch)
+    assert house.paper.nodes_asked == [4]  # as long as the workers are there
+    house.run(TIMINGS.shrink_after_s + 2)
+    assert house.paper.nodes_asked == [4, 1]
+    house.scale(2)
+    house.pool.tick()
+    assert house.paper.nodes_asked == [4, 1, 0]  # scaled by hand, workers that wait for a CPU ask for it themselves
+
+
 def test_a_worker_with_other_settings_another_installation_or_another_policy_ends_the_run() -> None:
     house = House(1, 3)
     house.paper.settings = "others"
