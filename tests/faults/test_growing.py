@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import threading
 import time
 from collections.abc import Iterator
 from contextlib import closing
@@ -50,24 +49,23 @@ def test_a_cluster_grows_as_the_run_asks_and_a_node_that_is_lost_again_costs_no_
 ) -> None:
     house = House(tmp_path, CONFIG)
     with catalog.locked(house.run), closing(house.executor):
-        used, lost, joining_node = set[str](), list[str](), list[threading.Thread]()
+        used, lost = set[str](), list[str]()
 
-        def grow_and_lose(sampled: list[Episode]) -> None:
+        def lose(_: list[Episode]) -> None:
             used.update(worker.identity.node_id for worker in house.workers if worker.identity)
-            if not joining_node and asked_cpus() > 1:  # a node takes a while to come, and the run goes on
-                joining_node.append(threading.Thread(target=add_node, args=[nodes]))
-                joining_node[0].start()
-            elif joining_node and not lost and len(used) > 1:
+            if not lost and len(used) > 1:
                 lost.extend(others(nodes))
                 nodes.remove_node(others(nodes)[lost[0]], allow_graceful=False)
 
-        deadline = time.monotonic() + 300
+        deadline, grown = time.monotonic() + 300, False
         while not lost:
             assert time.monotonic() < deadline, house.executor.pool.state.reason
-            house.check(house.sample(grow_and_lose))
+            if not grown and asked_cpus() > 1:
+                add_node(nodes)
+                grown = True
+            house.check(house.sample(lose))
         house.check(house.sample())
         assert used >= set(lost)
         assert asked_cpus() == 4 * CPUS_PER_WORKER
-        asked_of = house.executor.transport
-        asked_of.close()
+        house.executor.transport.close()
         assert asked_cpus() == 0
