@@ -37,6 +37,7 @@ from typing import Any
 
 from t6gps.service.pool.attempt import FailureKind
 from t6gps.service.pool.state import NEXT_PHASES, NEXT_STATES, Ending, RunState, WorkerPhase
+from t6gps.service.steering.events import EventKind
 
 REPOSITORY = Path(__file__).parents[1]
 FIGURES = REPOSITORY / "docs" / "figures"
@@ -47,6 +48,7 @@ STATES: dict[str, tuple[type[StrEnum], Mapping[Any, set[Any]] | None]] = {
     "run": (RunState, NEXT_STATES),
     "failure": (FailureKind, None),
     "ending": (Ending, None),
+    "event": (EventKind, None),
 }
 """Enums by the name of their marker, with what may follow each member where that is limited."""
 PROVENANCE = ("command", "commit", "machine", "date")

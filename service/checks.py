@@ -89,8 +89,10 @@ def cluster_address() -> str | None:
 
 def root_folder(wanted: Wanted) -> Finding:
     """The root, or the folder that it is to be made in, takes files, and has room for some."""
-    needed = f"a writable folder with {ROOT_BYTES // MEBIBYTE} MiB free"
+    needed = f"a writable folder with {ROOT_BYTES // MEBIBYTE} MiB free, not in a session folder of Ray"
     folder = wanted.root.absolute()
+    if any(machine.RAY_SESSION.fullmatch(part) for part in Path(os.path.realpath(folder)).parts):
+        return Finding("root", str(folder), needed, "choose a --root elsewhere: Ray's folder goes with its session")
     while not folder.exists() and folder != folder.parent:
         folder = folder.parent
     try:

@@ -6,6 +6,7 @@ Where the usual place does not do, another one is taken: nobody needs to know.
 from __future__ import annotations
 
 import os
+import re
 import resource
 import tempfile
 from collections.abc import Iterator
@@ -18,6 +19,8 @@ SOCKET_PATH_BYTES = 107
 """The kernel's limit for the path of a socket."""
 SOCKET_BELOW = "/session_2026-01-01_00-00-00_000000_1234567/sockets/plasma_store"
 """Where Ray puts its sockets below its folder."""
+RAY_SESSION = re.compile(r"session_\d{4}-\d{2}-\d{2}_\d{2}-\d{2}-\d{2}_\d+_\d+")
+"""Name of the folder of one start of Ray, which somebody removes some time after its end."""
 TEMPORARY_BYTES = 64 * MEBIBYTE
 """For the logs and sockets of a run."""
 STORE_BYTES, LEAST_STORE_BYTES = 2048 * MEBIBYTE, 128 * MEBIBYTE

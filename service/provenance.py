@@ -6,10 +6,16 @@ import hashlib
 import os
 import platform
 import subprocess
+from collections.abc import Mapping
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from importlib import metadata, util
 from pathlib import Path
+
+from t6gps.storage.schema import SCHEMA_VERSION
+
+SHORT_N = 12
+"""Digits of a digest that tell two apart in a message."""
 
 PACKAGES = ("t6gps", "pybullet", "numpy", "pyarrow", "torch", "ray")
 """Those on which the data of a run depend."""
@@ -62,6 +68,21 @@ def compiled() -> dict[str, str]:
     """SHA-256 of those of COMPILED that are built, by name."""
     specs = {name: util.find_spec(f"t6gps.{name}") for name in COMPILED}
     return {name: sha256(Path(spec.origin).read_bytes()) for name, spec in specs.items() if spec and spec.origin}
+
+
+def build() -> dict[str, str]:
+    """What data depend on in this installation, beside the settings: versions, digests and the schema, by names."""
+    digests = {f"compiled {name}": digest[:SHORT_N] for name, digest in compiled().items()}
+    return {**versions(), "schema": str(SCHEMA_VERSION), **digests}
+
+
+def differences(found: Mapping[str, str], here: Mapping[str, str]) -> str:
+    """In what one `build` is another than the run's, with both values; empty where they are alike."""
+    return ", ".join(
+        f"{name} {found.get(name, 'none')} (the run: {here.get(name, 'none')})"
+        for name in {**here, **found}
+        if found.get(name) != here.get(name)
+    )
 
 
 def sha256(content: bytes) -> str:

@@ -7,7 +7,8 @@ ROOT/NAME/tables/         frames, episodes, iterations, classes: Delta tables
 ROOT/NAME/spool/          episodes of the iteration being sampled
 ROOT/NAME/checkpoints/    states of the learner
 ROOT/NAME/figures/        pictures drawn from the tables
-ROOT/NAME/pool/           scale request, status and decisions of a running run
+ROOT/NAME/request.json    what somebody asks of the process that runs it
+ROOT/NAME/pool/           status, events and decisions of a running run
 ROOT/NAME/bundles/        episodes that failed, with what is needed to run them alone
 """
 
@@ -68,6 +69,10 @@ class Run:
     @property
     def pool(self) -> Path:
         return self.path / "pool"
+
+    @property
+    def request(self) -> Path:
+        return self.path / "request.json"
 
     @property
     def bundles(self) -> Path:
@@ -248,7 +253,8 @@ def _is_run(run: Run) -> bool:
 def locked(run: Run) -> Iterator[None]:
     """Hold the run for this process alone; the lock ends with the process, however it ends.
 
-    Raises RunError naming the process that holds it, or why the run cannot be held.
+    What was asked of a process that has ended is forgotten. Raises RunError naming the process that holds it, or why
+    the run cannot be held.
     """
     with _lock_file(run, "a+") as file:
         deadline = time.monotonic() + GLANCE_S
@@ -263,6 +269,7 @@ def locked(run: Run) -> Iterator[None]:
         if not _is_of(file, run):
             raise RunError(f"run {run.name} was moved or removed just now; see t6gps runs")
         file.truncate(0)
+        run.request.unlink(missing_ok=True)  # before anybody reads whom to ask now
         file.write(f"{os.getpid()} on {socket.gethostname()}")
         file.flush()
         yield

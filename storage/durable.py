@@ -55,6 +55,18 @@ def publish(path: Path) -> None:
     sync(path.parent)
 
 
+def replace(path: Path, content: bytes) -> None:
+    """Give the file `path` this content, whole or not at all; of many who do so at once, one after the other does."""
+    unfinished = _unique(path, _PARTIAL)
+    try:
+        unfinished.write_bytes(content)
+        sync(unfinished)
+        unfinished.replace(path)
+    finally:
+        unfinished.unlink(missing_ok=True)
+    sync(path.parent)
+
+
 @contextmanager
 def draft(path: Path) -> Iterator[Path]:
     """A new hidden folder beside `path`, known to this caller alone; what has not been claimed is removed."""

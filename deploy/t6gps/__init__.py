@@ -10,7 +10,7 @@ if TYPE_CHECKING:
     from t6gps.service.api.run import Run, open_run, runs
     from t6gps.service.api.training import Progress, evaluate, train
     from t6gps.service.config import presets
-    from t6gps.service.pool.control import Status
+    from t6gps.service.steering.status import Status
     from t6gps.service.training.evaluation import Evaluation
     from t6gps.storage.errors import ConfigError, QueryError, RunError, T6GpsError
 
@@ -25,7 +25,7 @@ else:
         "evaluate": "t6gps.service.api.training",
         "train": "t6gps.service.api.training",
         "presets": "t6gps.service.config",
-        "Status": "t6gps.service.pool.control",
+        "Status": "t6gps.service.steering.status",
         "Evaluation": "t6gps.service.training.evaluation",
         "ConfigError": "t6gps.storage.errors",
         "QueryError": "t6gps.storage.errors",

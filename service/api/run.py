@@ -14,8 +14,9 @@ from t6gps.service import config as configuration
 from t6gps.service.api import policy
 from t6gps.service.api.policy import Policy
 from t6gps.service.config import Config
-from t6gps.service.pool import control
-from t6gps.service.pool.control import Status
+from t6gps.service.steering import events, requests, status
+from t6gps.service.steering.events import Event
+from t6gps.service.steering.status import Status
 from t6gps.service.training import evaluation
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import catalog, tables
@@ -74,14 +75,33 @@ class Run:
 
     def status(self) -> Status:
         """How the run is: its state, workers, and who waits for whom. RunError when it never had workers."""
-        return control.status(self._folder)
+        return status.status(self._folder)
 
     def scale(self, workers: int) -> Status:
         """Give the running run that many workers, 0 pauses it, and wait until it has them; its status then.
 
         RunError when it is not running, the number is not allowed, or the workers are not there within 30 s.
         """
-        return control.scale(self._folder, workers)
+        return requests.scale(self._folder, workers)
+
+    def pause(self) -> Status:
+        """Give the running run no workers, and let it remember how many it had. Status and errors as `scale`."""
+        return requests.pause(self._folder)
+
+    def unpause(self) -> Status:
+        """Give the paused run what it had before. Status and errors as `scale`."""
+        return requests.unpause(self._folder)
+
+    def stop(self) -> None:
+        """Stop the running run as Ctrl-C does, and wait until it has ended; `resume` continues it.
+
+        RunError when it is not running, or has not ended within a minute.
+        """
+        requests.stop(self._folder)
+
+    def events(self) -> list[Event]:
+        """What happened to its workers and episodes, each with time and reason; none without workers."""
+        return events.read(self._folder)
 
     @property
     def _folder(self) -> catalog.Run:

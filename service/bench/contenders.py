@@ -30,8 +30,8 @@ from t6gps.service.bench.tally import NotingWorker, Tally, steps_of
 from t6gps.service.config import Config
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.execution.wiring import new_learner
-from t6gps.service.pool import control
 from t6gps.service.pool.attempt import Failure, attempt
+from t6gps.service.pool.pool import TICK_S
 from t6gps.service.pool.state import RunState
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
@@ -202,6 +202,6 @@ def opened(config: Config, **options: Any) -> Iterator[tuple[RayExecutor, Spool]
                     raise RunError(
                         f"the workers did not start within {START_DEADLINE_S:.0f} s: {executor.pool.state.reason}"
                     )
-                executor.pool.tick(control.TICK_S)
+                executor.pool.tick(TICK_S)
             yield executor, Spool(run.spool, 0)
             executor.close(RunState.DONE)

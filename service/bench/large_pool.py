@@ -26,9 +26,9 @@ from t6gps.service.bench.contenders import Enough, Job
 from t6gps.service.bench.role_clock import RoleClock
 from t6gps.service.bench.tally import Tally, steps_of
 from t6gps.service.config import Config
-from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.ledger import Ledger
+from t6gps.service.pool.outside import Nobody
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.state import Identity, PoolState, RunState, WorkerId
 from t6gps.service.ray_backend.cluster import connection, this_node
@@ -147,7 +147,7 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
     ledger, clock, tally = _TimedLedger(), RoleClock(), Tally(seconds)
     transport = SlotsTransport(job, workers_n)
     state = PoolState(workers_n, "", ledger, TIMINGS, EpisodeTimes(TIMINGS.shortest_episode_s))
-    pool = Pool(state, transport, Control(None, workers_n), lambda _: None)
+    pool = Pool(state, transport, Nobody(), lambda _: None)
     with tempfile.TemporaryDirectory() as folder:
         spool = Spool(Path(folder), 0)
         while state.condition is not RunState.RUNNING:

@@ -10,8 +10,9 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol, final
 
 import pyarrow as pa
 
-from t6gps.service.pool import control
-from t6gps.service.pool.control import Status
+from t6gps.service.steering import requests
+from t6gps.service.steering import status as statuses
+from t6gps.service.steering.status import Status
 from t6gps.service.training import evaluation, origin, summary
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
@@ -59,11 +60,11 @@ class Local:
 
     def status(self, name: str) -> Status:
         """How a run is."""
-        return control.status(catalog.open_run(self.root, name))
+        return statuses.status(catalog.open_run(self.root, name))
 
     def scale(self, name: str, workers: int, deadline_s: float) -> Status:
         """Give a running run so many workers; its status then."""
-        return control.scale(catalog.open_run(self.root, name), workers, deadline_s)
+        return requests.scale(catalog.open_run(self.root, name), workers, deadline_s)
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table. An error for a run that is not whole."""

@@ -20,12 +20,13 @@ from t6gps.service.launch import target as targets
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.target import Kind
+from t6gps.service.steering import requests
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError, T6GpsError
 
-STOP_S, CANCEL_S, TICK_S = 60.0, 60.0, 0.2
-"""How long a job has to stop cleanly and then to be ended, and how often it is looked at."""
+CANCEL_S, TICK_S = 60.0, 0.2
+"""How long a job has that is ended, and how often it is looked at."""
 INTERRUPTED = 130
 JOB_COLUMNS = {
     "name": ("job", "{}"),
@@ -100,17 +101,26 @@ def logs(
         raise typer.Exit(INTERRUPTED) from None
 
 
-def stop(name: JobName, root: Root = DEFAULT_ROOT) -> None:
-    """Stop a job cleanly; end it where it does not stop. Everything sampled is kept."""
-    job = submission.named(root, name)
+def stop(
+    name: JobName,
+    root: Root = DEFAULT_ROOT,
+    deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for it (s).")] = (
+        requests.STOP_DEADLINE_S
+    ),
+) -> None:
+    """Stop a run as Ctrl-C does, and end the job that does not stop. Everything sampled is kept."""
+    job = records.find(root, name)
+    if job is None:
+        typer.echo(f"run {name}: {requests.stop(catalog.open_run(root, name), deadline_s)}")
+        return
     launcher = launchers.serving(job)
     state, _ = launcher.state(job)
     if state in ENDED:
         raise RunError(f"job {job.name} is {state} already; there is nothing to stop")
     launcher.stop(job)
-    ended = _ended(launcher, job, STOP_S)
+    ended = _ended(launcher, job, deadline_s)
     if ended is None:
-        terminal.warn(f"job {job.name} has not stopped within {STOP_S:.0f} s; it is ended")
+        terminal.warn(f"job {job.name} has not stopped within {deadline_s:.0f} s; it is ended")
         launcher.cancel(job)
         ended = _ended(launcher, job, CANCEL_S)
     if ended is None:

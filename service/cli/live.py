@@ -1,4 +1,4 @@
-"""The commands for a run that is running, and for what it had to set aside: `scale`, `status`, `replay`."""
+"""The commands for a run that is running, and for what it had to set aside: `scale`, `stop`, `status`, `replay`."""
 
 from __future__ import annotations
 
@@ -13,12 +13,16 @@ from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName, Server
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
-from t6gps.service.pool import control, crash_bundle
+from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.attempt import Failure
-from t6gps.service.pool.control import Status
+from t6gps.service.steering import events as happened
+from t6gps.service.steering import requests
+from t6gps.service.steering.status import Status
 from t6gps.service.views import terminal
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 
+Deadline = Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for that (s).")]
 WORKER_COLUMNS = {
     "slot": ("slot", "{:d}"),
     "incarnation": ("incarnation", "{:d}"),
@@ -33,7 +37,7 @@ WORKER_COLUMNS = {
 def add_to(app: typer.Typer) -> None:
     """Make the commands part of `t6gps`."""
     app.command(context_settings={"ignore_unknown_options": True})(scale)  # so that -1 is a number, and refused as one
-    for command in (status, replay):
+    for command in (pause, unpause, status, events, replay):
         app.command()(command)
 
 
@@ -42,9 +46,7 @@ def scale(
     workers: Annotated[int, typer.Argument(metavar="N", help="Workers from now on; 0 pauses the run.")],
     root: Root = DEFAULT_ROOT,
     server: Server = None,
-    deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for them (s).")] = (
-        control.SCALE_DEADLINE_S
-    ),
+    deadline_s: Deadline = requests.SCALE_DEADLINE_S,
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
     job = None if server else records.find(root, run_name)
@@ -53,6 +55,20 @@ def scale(
             reached = runs.scale(run_name, workers, deadline_s)
     else:
         reached = launchers.serving(job).scale(job, workers, deadline_s)
+    _tell_reached(run_name, reached)
+
+
+def pause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+    """Give a running run no workers for now; `unpause` gives it what it had."""
+    _tell_reached(run_name, requests.pause(catalog.open_run(root, run_name), deadline_s))
+
+
+def unpause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+    """Give a paused run the workers, or the autoscaling, that it had."""
+    _tell_reached(run_name, requests.unpause(catalog.open_run(root, run_name), deadline_s))
+
+
+def _tell_reached(run_name: str, reached: Status) -> None:
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
@@ -92,6 +108,16 @@ def _print_status(run_name: str, state: Status, as_json: bool) -> None:
     typer.echo("\n".join(lines))
     if state["workers"]:
         terminal.print_rows("Workers", [dict(worker) for worker in state["workers"]], WORKER_COLUMNS)
+
+
+def events(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+    """Say what happened to a run: starts, scaling, failures, replacements, each with its reason."""
+    found = happened.read(catalog.open_run(root, run_name))
+    if as_json:
+        typer.echo(json.dumps({"events": found}))
+        return
+    for event in found:
+        typer.echo(f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}")
 
 
 def replay(

@@ -14,21 +14,23 @@ import ray
 
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import Progress
-from t6gps.service import caller
+from t6gps.service import caller, provenance
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.ray_learner import RayLearner
-from t6gps.service.pool import control
 from t6gps.service.pool.attempt import policy_digest, settings_digest
-from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes, Timings
 from t6gps.service.pool.decision_log import DecisionLog
-from t6gps.service.pool.pool import Pool
+from t6gps.service.pool.outside import Nobody
+from t6gps.service.pool.pool import TICK_S, Pool
 from t6gps.service.pool.state import PoolState, RunState
 from t6gps.service.ray_backend import cluster
 from t6gps.service.ray_backend.cluster import Reference
 from t6gps.service.ray_backend.transport import RayTransport, SharedEpisode
 from t6gps.service.ray_backend.worker_actor import MakeWorker
+from t6gps.service.steering import requests
+from t6gps.service.steering.desk import Desk
+from t6gps.service.steering.requests import What
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.worker import RolloutWorker
@@ -59,13 +61,15 @@ class RayExecutor(Executor):
             timings,
             EpisodeTimes(timings.shortest_episode_s),
             config.run.autoscale,
+            build=provenance.build(),
         )
         with ExitStack() as started:
             most = started.enter_context(cluster.connection(config))
             self.transport = RayTransport(make_worker, config.rollout, config.run.cpus_per_worker, timings)
             started.callback(self.transport.close)
             log = None if run is None else DecisionLog(run.pool)
-            self.pool = Pool(state, self.transport, Control(run, most), self._quarantine, log)
+            outside = Nobody() if run is None else Desk(run, most)
+            self.pool = Pool(state, self.transport, outside, self._quarantine, log)
             self.tend()
             self._held = started.pop_all()
 
@@ -93,7 +97,7 @@ class RayExecutor(Executor):
         self._keep_ahead = None
         quarantined = self._open(plans, snapshot, purpose)
         self.transport.policies.publish(snapshot)
-        while not self.transport.policies.has_the_newest(control.TICK_S):
+        while not self.transport.policies.has_the_newest(TICK_S):
             self.tend()
         self.pool.open(plans, quarantined, {snapshot.version: policy_digest(snapshot)})
 
@@ -119,14 +123,18 @@ class RayExecutor(Executor):
         self._closed = True
         with caller.undisturbed(), self._held:
             if ray.is_initialized():  # its caller may have ended it
-                self.pool.close(outcome, "" if outcome is RunState.DONE else "the run was stopped")
+                self.pool.close(outcome, "" if outcome is RunState.DONE else self._why_stopped())
                 self.replace_learner()
+
+    def _why_stopped(self) -> str:
+        asked = None if self.run is None else requests.read(self.run)
+        return "t6gps stop" if asked is not None and asked.what is What.STOP else "Ctrl-C, SIGTERM or an error"
 
     def _until_done(self, reference: Reference) -> None:
         """Wait for the learner, and tend the pool meanwhile."""
         self.pool.wait("the run", "the learner", True)
         try:
-            while not ray.wait([reference], timeout=control.TICK_S)[0]:
+            while not ray.wait([reference], timeout=TICK_S)[0]:
                 self.tend()
                 self.learner.check_life()
         finally:
@@ -135,7 +143,7 @@ class RayExecutor(Executor):
 
     def tend(self) -> None:
         """Let the pool work, but not all the time, and keep what was sampled ahead."""
-        if time.monotonic() - self.pool.ticked_s < control.TICK_S:
+        if time.monotonic() - self.pool.ticked_s < TICK_S:
             return
         self.pool.tick()
         if self._keep_ahead is not None:

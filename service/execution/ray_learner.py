@@ -7,6 +7,7 @@ lets go of it. Its fits run as Ray tasks beside it.
 from __future__ import annotations
 
 import math
+import socket
 import time
 from collections import deque
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
@@ -20,10 +21,10 @@ import ray
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.rows import AnyArray
-from t6gps.service import threads
+from t6gps.service import provenance, threads
 from t6gps.service.config import Config
-from t6gps.service.pool import control
 from t6gps.service.pool.deadlines import Timings
+from t6gps.service.pool.pool import TICK_S
 from t6gps.service.ray_backend import processes, pulse
 from t6gps.service.ray_backend.cluster import Reference, start_actor
 from t6gps.service.ray_backend.pulse import Pulse, Watch
@@ -73,7 +74,7 @@ class LearnerActor:
         """What the phase yields, but not more often than somebody would look: telling costs more than some steps."""
         told_s = -math.inf
         for done, total in getattr(self._learner, phase.name)():
-            if done == total or time.monotonic() - told_s >= control.TICK_S:
+            if done == total or time.monotonic() - told_s >= TICK_S:
                 told_s = time.monotonic()
                 yield done, total
 
@@ -212,18 +213,28 @@ def _get(reference: Reference) -> Any:
         ) from error
 
 
-def _with_one_thread(function: Callable[[Job], Result]) -> Callable[[Job], Result]:
+def as_at_home(function: Callable[[Job], Result], build: Mapping[str, str]) -> Callable[[Job], Result]:
+    """The function as it runs in the learner's own process, wherever Ray runs it: with one thread, on the same `build`.
+
+    RunError naming the node and what is installed there otherwise.
+    """
+
     def limited(job: Job) -> Result:
-        _limit_once()
+        if others := provenance.differences(_prepared_once(), build):
+            raise RunError(
+                f"node {socket.gethostname()} has another installation than the run: {others}; install the same on "
+                "every node, then resume with --resume"
+            )
         return function(job)
 
     return limited
 
 
 @cache
-def _limit_once() -> None:
-    """Set what holds as long as the process lives, and takes some milliseconds to set."""
+def _prepared_once() -> Mapping[str, str]:
+    """Set what holds as long as the process lives, and look at what does; both take some milliseconds."""
     threads.limit()
+    return provenance.build()
 
 
 def _task_map(width: int) -> Callable[..., Iterator[Any]]:
@@ -233,8 +244,10 @@ def _task_map(width: int) -> Callable[..., Iterator[Any]]:
     a pipelined run.
     """
 
+    build = provenance.build()
+
     def task_map(function: Callable[[Any], Any], jobs: Iterable[Any]) -> Iterator[Any]:
-        task = ray.remote(num_cpus=0, max_retries=3)(_with_one_thread(function))
+        task = ray.remote(num_cpus=0, max_retries=3)(as_at_home(function, build))
         pending: deque[Reference] = deque()
         for job in jobs:
             pending.append(task.remote(job))

@@ -9,7 +9,7 @@ from t6gps.service.config import Config
 from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.job import Job, JobState
-from t6gps.service.pool.control import Status
+from t6gps.service.steering.status import Status
 
 
 class Launcher(Protocol):
@@ -48,7 +48,7 @@ class Launcher(Protocol):
         ...
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
-        """Give the run of a job `workers` workers, and wait for them; its status then. Errors as `control.scale`."""
+        """Give the run of a job `workers` workers, and wait for them; its status then. Errors as `requests.scale`."""
         ...
 
     def source(self, job: Job) -> Source:

@@ -11,8 +11,9 @@ from t6gps.service.config import Config
 from t6gps.service.launch.fetch import FolderSource, Source
 from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.job import ENDED, Job, JobState
-from t6gps.service.pool import control
-from t6gps.service.pool.control import Status
+from t6gps.service.steering import requests
+from t6gps.service.steering import status as statuses
+from t6gps.service.steering.status import Status
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
@@ -61,10 +62,10 @@ class VisibleLauncher(ABC):
         if not catalog.exists(Path(job.root), job.run):
             return None
         run = _run(job)
-        return control.status(run) if (run.pool / "status.json").exists() else None
+        return statuses.status(run) if (run.pool / "status.json").exists() else None
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
-        return control.scale(_run(job), workers, deadline_s)
+        return requests.scale(_run(job), workers, deadline_s)
 
     def source(self, job: Job) -> Source:
         return FolderSource(_run(job))

@@ -117,9 +117,14 @@ class Capacity:
 
 @dataclass(frozen=True)
 class ScaleRequested:
-    """Somebody asks for another number of workers."""
+    """Somebody asks for another number of workers; none is a pause."""
 
     workers: int
+
+
+@dataclass(frozen=True)
+class UnpauseRequested:
+    """Somebody asks for what there was before the pause."""
 
 
 @dataclass(frozen=True)
@@ -128,7 +133,19 @@ class Paused:
 
 
 Observation = (
-    Opened | Ready | Alive | Sampled | Failed | Unserved | Died | Ended | Durable | Capacity | ScaleRequested | Paused
+    Opened
+    | Ready
+    | Alive
+    | Sampled
+    | Failed
+    | Unserved
+    | Died
+    | Ended
+    | Durable
+    | Capacity
+    | ScaleRequested
+    | UnpauseRequested
+    | Paused
 )
 
 
@@ -170,6 +187,13 @@ class AskCapacity:
 
 
 @dataclass(frozen=True)
+class AskNodes:
+    """Let the cluster have room for so many workers, where it can grow; none is the end of that."""
+
+    workers: int
+
+
+@dataclass(frozen=True)
 class Accept:
     """Hand an episode that came back to the run; a `Durable` follows. Others that came back are dropped."""
 
@@ -192,4 +216,4 @@ class Publish:
     reason: str
 
 
-Instruction = Start | Send | Ping | End | AskCapacity | Accept | Quarantine | Publish
+Instruction = Start | Send | Ping | End | AskCapacity | AskNodes | Accept | Quarantine | Publish

@@ -7,17 +7,19 @@ import time
 from collections import deque
 from collections.abc import Callable, Mapping, Sequence
 
-from t6gps.service.pool import control, messages
+from t6gps.service.pool import messages
 from t6gps.service.pool.attempt import Failure
-from t6gps.service.pool.control import Control, Status
 from t6gps.service.pool.decision_log import DecisionLog
 from t6gps.service.pool.messages import Instruction, Observation
+from t6gps.service.pool.outside import Outside, Situation
 from t6gps.service.pool.state import Ending, PoolState, RunState, WorkerId
 from t6gps.service.pool.supervisor import decide
 from t6gps.service.pool.transport import Done, Transport
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, EpisodePlan
 
+TICK_S = 0.1
+"""How often a pool looks when nothing comes."""
 PAUSE_S = 2.0
 """A pool looks ten times a second. One that did not for so long stood still, with its process or its machine."""
 
@@ -35,13 +37,13 @@ class Pool:
         self,
         state: PoolState,
         transport: Transport,
-        control_: Control,
+        outside: Outside,
         quarantine: Callable[[EpisodePlan], None],
         log: DecisionLog | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.state, self.phase, self.ticked_s = state, "starting", float("-inf")
-        self._transport, self._control, self._quarantine = transport, control_, quarantine
+        self._transport, self._outside, self._quarantine = transport, outside, quarantine
         self._log, self._clock = log, clock
         self._unseen: list[Observation] = []
         self._came: dict[tuple[WorkerId, int], Episode] = {}
@@ -57,12 +59,9 @@ class Pool:
         before_s, self.ticked_s = self.ticked_s, self._clock()
         if PAUSE_S < self.ticked_s - before_s < math.inf:
             self._unseen.append(messages.Paused())
-        workers = self._control.scale_request()
-        if workers is not None:
-            self._unseen.append(messages.ScaleRequested(workers))
+        self._unseen += self._outside.asked()
         self._decide()
-        if self._control.due(self.ticked_s, self.state.condition):
-            self._control.publish(self.status())
+        self._outside.told(self.situation())
         if self.state.condition is RunState.FAILED:
             raise RunError(self.state.reason)
         if wait_s > 0:
@@ -78,7 +77,7 @@ class Pool:
     def sample(self, keep: Callable[[Episode], None]) -> None:
         """Let the workers run the batch until no episode is missing; see `deliver` for `keep`."""
         while self.state.ledger.backlog:
-            self.tick(0.0 if self._accepted else control.TICK_S)
+            self.tick(0.0 if self._accepted else TICK_S)
             self.deliver(keep)
         if self.state.ledger.hopeless:
             self.tick()
@@ -100,7 +99,7 @@ class Pool:
         self.state.workers.clear()
         if self.state.condition is not RunState.FAILED:
             self.state.turn(condition, reason)
-        self._control.publish(self.status())
+        self._outside.ended(self.situation())
 
     def wait(self, who: str, whom: str, begins: bool) -> None:
         """Note that somebody begins or ends to wait for somebody."""
@@ -109,9 +108,9 @@ class Pool:
         else:
             self._waits.pop(f"{who} waits for {whom}", None)
 
-    def status(self) -> Status:
-        """Everything that `t6gps status` shows."""
-        return control.describe(self.state, self.phase, self._waits, self._clock())
+    def situation(self) -> Situation:
+        """How the pool is, for whoever tells others."""
+        return Situation(self.state, self.phase, self._waits, self._clock())
 
     def _listen(self, wait_s: float) -> None:
         """Take what the transport reports; episodes stay here, the supervisor sees their size."""
@@ -139,6 +138,7 @@ class Pool:
             decided = decide(self.state, observed, now)
             if self._log is not None:
                 self._log.after(self.state, now, observed, decided)
+            self._outside.decided(self.situation(), observed, decided)
             for instruction in decided:
                 self._carry_out(instruction)
         self._came.clear()
@@ -159,10 +159,12 @@ class Pool:
             case messages.AskCapacity():
                 waiting = tuple(worker for worker in instruction.starting if not self._transport.placed(worker))
                 self._unseen.append(messages.Capacity(self._transport.free_workers(), waiting))
+            case messages.AskNodes():
+                self._transport.ask_nodes(instruction.workers)
             case messages.Accept():
                 episode = self._came.pop((instruction.worker, instruction.episode_id))
                 self._accepted.append((instruction.episode_id, episode))
             case messages.Quarantine():
                 self._quarantine(instruction.plan)
             case messages.Publish():
-                self._control.publish(self.status())
+                self._outside.told(self.situation(), at_once=True)

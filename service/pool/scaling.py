@@ -1,10 +1,10 @@
-"""How many workers a run shall have: as asked for by hand, or by backlog and room."""
+"""How many workers a run shall have: as asked for by hand, or by backlog and room; and the room that it asks for."""
 
 from __future__ import annotations
 
 import math
 
-from t6gps.service.pool.messages import AskCapacity
+from t6gps.service.pool.messages import AskCapacity, AskNodes
 from t6gps.service.pool.state import PoolState, Worker, WorkerPhase
 
 PLANS_PER_WORKER = 2
@@ -26,13 +26,27 @@ def autoscale(state: PoolState, now: float) -> None:
     """Move `wanted` between its bounds: up at once, down when workers were not needed for a while."""
     if state.autoscale is None:
         return
-    least, most = state.autoscale
+    least, _ = state.autoscale
     room = sum(not pending(state, worker) for worker in state.workers.values()) + max(state.free_n, 0)
-    useful = min(most, max(least, min(room, math.ceil(state.ledger.backlog / PLANS_PER_WORKER))))
+    useful = min(_useful(state, *state.autoscale), max(least, room))
     if useful >= state.wanted:
         state.wanted, state.needed_s = useful, now
     elif state.needed_s is None or now - state.needed_s > state.timings.shrink_after_s:
         state.wanted = useful
+
+
+def ask_nodes(state: PoolState) -> list[AskNodes]:
+    """Ask for room for as many workers as were of use, and for those that there are; when that number changes."""
+    useful = 0 if state.autoscale is None else max(_useful(state, *state.autoscale), state.wanted)
+    if useful == state.asked_n:
+        return []
+    state.asked_n = useful
+    return [AskNodes(useful)]
+
+
+def _useful(state: PoolState, least: int, most: int) -> int:
+    """Workers that the backlog would keep at work, were there room."""
+    return min(most, max(least, math.ceil(state.ledger.backlog / PLANS_PER_WORKER)))
 
 
 def pending(state: PoolState, worker: Worker) -> bool:

@@ -6,6 +6,7 @@ Everything is plain data, so that a state can be written down and read again (`d
 from __future__ import annotations
 
 from collections import deque
+from collections.abc import Mapping
 from dataclasses import dataclass, field
 from enum import StrEnum
 from typing import NamedTuple
@@ -103,12 +104,14 @@ class Identity:
 
     node      the address of its machine
     node_id   the cluster's name for it
+    build     what its data depend on beside the settings: versions and digests by name (`provenance.build`)
     """
 
     pid: int
     node: str
     node_id: str
     settings_digest: str
+    build: Mapping[str, str] = field(default_factory=dict)
 
 
 @dataclass
@@ -154,10 +157,12 @@ class Slot:
     failures_n: int = 0
     retry_s: float | None = None
     """No worker is started here before."""
+    trouble: str = ""
+    """Why the last worker here failed, in words; empty when it was not needed any more."""
 
-    def failed(self, now: float) -> None:
+    def failed(self, now: float, trouble: str) -> None:
         """A worker has failed here: the first time costs nothing, then each wait is twice as long as the last."""
-        self.failures_n += 1
+        self.failures_n, self.trouble = self.failures_n + 1, trouble
         if self.failures_n > 1:
             self.retry_s = now + min(FIRST_BACK_OFF_S * 2 ** (self.failures_n - 2), LONGEST_BACK_OFF_S)
 
@@ -167,12 +172,15 @@ class PoolState:
     """Everything that a decision of the supervisor depends on, beside what it observes and the time.
 
     wanted             workers that the run shall have; `autoscale` (least, most) moves it
+    before_pause       the two of them before the run was scaled to none
     settings_digest    every worker must have the settings that this stands for
+    build              what every worker's installation must be (`Identity`)
     policy_digests     the policies that the plans of the batch name, by version
     largest_bytes      of an episode so far: episodes under way count with it
     failed_starts_n    starts in a row that failed
     last_trouble       the newest failure, in words
     free_n, asked_s    room for more workers, and when the cluster was asked
+    asked_n            workers that the cluster was last asked to have room for
     needed_s           when autoscaling last needed as many workers as there are
     judges_from_s      when deadlines count again
     """
@@ -183,6 +191,8 @@ class PoolState:
     timings: Timings
     times: EpisodeTimes
     autoscale: tuple[int, int] | None = None
+    before_pause: tuple[int, tuple[int, int] | None] | None = None
+    build: dict[str, str] = field(default_factory=dict)
     condition: RunState = RunState.DEGRADED
     reason: str = "the workers are starting"
     workers: dict[int, Worker] = field(default_factory=dict)
@@ -194,6 +204,7 @@ class PoolState:
     last_trouble: str = ""
     free_n: int = 0
     asked_s: float | None = None
+    asked_n: int = 0
     needed_s: float | None = None
     judges_from_s: float | None = None
     counters: dict[str, int] = field(

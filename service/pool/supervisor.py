@@ -11,11 +11,12 @@ from __future__ import annotations
 from collections import deque
 from collections.abc import Iterator, Sequence
 
+from t6gps.service import provenance
 from t6gps.service.pool import messages, scaling
 from t6gps.service.pool.attempt import Failure, FailureKind
 from t6gps.service.pool.messages import Instruction, Observation
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
-from t6gps.service.pool.state import Ending, PoolState, RunState, Slot, Worker, WorkerId, WorkerPhase
+from t6gps.service.pool.state import Ending, Identity, PoolState, RunState, Slot, Worker, WorkerId, WorkerPhase
 from t6gps.storage.records import EpisodePlan
 
 BREAKER_N = 5
@@ -33,6 +34,7 @@ def decide(state: PoolState, observed: Sequence[Observation], now: float) -> lis
     instructions = [instruction for observation in observed for instruction in _observe(state, observation, now)]
     instructions += scaling.ask_capacity(state, now)
     scaling.autoscale(state, now)
+    instructions += scaling.ask_nodes(state)
     for step in (_end_overdue, _drain, _fill, _send):
         instructions += step(state, now)
     before = state.condition, state.reason
@@ -57,7 +59,13 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
         case messages.Paused():
             state.judges_from_s = now + GRACE_S
         case messages.ScaleRequested():
+            if observation.workers or state.wanted:
+                state.before_pause = None if observation.workers else (state.wanted, state.autoscale)
             state.wanted, state.autoscale = observation.workers, None  # scaled by hand: it stays so
+        case messages.UnpauseRequested():
+            if state.before_pause is not None:
+                state.wanted, state.autoscale = state.before_pause
+                state.before_pause = None
         case messages.Ended():
             yield from _on_ended(state, observation.worker, observation.post_mortem)
         case _:
@@ -69,9 +77,8 @@ def _observe(state: PoolState, observation: Observation, now: float) -> Iterator
 def _on_report(state: PoolState, worker: Worker, report: Observation, now: float) -> Iterator[Instruction]:
     match report:
         case messages.Ready():
-            if report.identity.settings_digest != state.settings_digest:
-                why = "has other settings than the run; install the same version on every node"
-                _fail(state, f"worker {worker.id} {why}")
+            if why := _unlike(state, report.identity):
+                _fail(state, f"worker {worker.id} on node {report.identity.node} {why}")
                 return
             worker.identity, worker.since_s = report.identity, now
             worker.enter(WorkerPhase.IDLE)
@@ -94,6 +101,16 @@ def _on_report(state: PoolState, worker: Worker, report: Observation, now: float
             state.largest_bytes = max(state.largest_bytes, report.nbytes)
             if state.ledger.arrive(report.plan):
                 yield messages.Accept(worker.id, report.plan.episode_id)
+
+
+def _unlike(state: PoolState, found: Identity) -> str:
+    """What a worker has otherwise than the run, in words; empty where it has nothing."""
+    others = provenance.differences(found.build, state.build)
+    if others:
+        return f"has another installation than the run: {others}; install the same on every node"
+    if found.settings_digest != state.settings_digest:
+        return "has other settings than the run; install the same version on every node"
+    return ""
 
 
 def _on_result(state: PoolState, worker: Worker, plan: EpisodePlan, at_s: float) -> float:
@@ -137,9 +154,11 @@ def _record_failure(state: PoolState, plan: EpisodePlan, failure: Failure) -> It
 def _end(state: PoolState, worker: Worker, now: float, why: Ending, error: str = "", message: str = "") -> messages.End:
     """The one way in which a worker goes, planned (drained) or not."""
     if why is not Ending.DRAINED:
-        state.slots[worker.id.slot].failed(now)
+        state.slots[worker.id.slot].failed(now, f"{error}: {message}")
         state.last_trouble = f"worker {worker.id}: {error}: {message}"
         state.failed_starts_n += worker.phase is WorkerPhase.STARTING
+    else:
+        state.slots[worker.id.slot].trouble = ""
     state.counters[why] += 1
     worker.ending = why, error, message
     worker.enter(WorkerPhase.ENDING)
@@ -253,7 +272,7 @@ def _update_condition(state: PoolState) -> None:
             "mend the cause, then resume with --resume",
         )
     elif state.wanted == 0:
-        state.turn(RunState.PAUSED, "scaled to no workers; scale up to continue")
+        state.turn(RunState.PAUSED, "scaled to no workers; t6gps unpause or t6gps scale continues it")
     elif ready_n >= state.wanted:
         state.turn(RunState.RUNNING, "")
     elif pending_n:

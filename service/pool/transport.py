@@ -60,5 +60,9 @@ class Transport(ABC):
         """False while there is no room for a worker that was started."""
 
     @abstractmethod
+    def ask_nodes(self, workers: int) -> None:
+        """Let the cluster have room for so many workers, where it can grow, until this is called again."""
+
+    @abstractmethod
     def free_workers(self) -> int:
         """How many more workers there is room for."""

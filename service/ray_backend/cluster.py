@@ -14,6 +14,7 @@ from contextlib import ExitStack, contextmanager
 from typing import Any, TypeAlias
 
 import ray
+from ray.autoscaler.sdk import request_resources
 from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 
 from t6gps.service import caller, checks, machine
@@ -126,6 +127,14 @@ def this_node() -> str:
 def free_workers(cpus_per_worker: float) -> int:
     """Workers that still find room: what is left on one node is of no use to a worker on another."""
     return sum(int(free / cpus_per_worker + 1e-6) for free in private.free_cpus_by_node())
+
+
+def ask_nodes(workers: int, cpus_per_worker: float) -> None:
+    """Let an autoscaler of Ray, where the cluster has one, keep room for so many workers on all nodes together.
+
+    It heeds the last call. Nodes that nobody uses or asks for go after its own time.
+    """
+    request_resources(bundles=[{"CPU": cpus_per_worker}] * workers)
 
 
 def _enter(connected: ExitStack, trouble: str, remedy: str, options: dict[str, Any]) -> None:

@@ -88,6 +88,7 @@ class RayTransport(Transport):
         self._over: SimpleQueue[tuple[Call, Future[Any], float]] = SimpleQueue()
         self.policies = PolicyServer(self._node, timings)
         self._followed = self.policies.source.number
+        self._asked_nodes = False
 
     def start(self, worker: WorkerId) -> None:
         actor = start_actor(WorkerActor, cpus=self._cpus)
@@ -200,11 +201,17 @@ class RayTransport(Transport):
         """End what looks after the workers: the policy server, and the agents of other nodes."""
         if not ray.is_initialized():
             return
+        if self._asked_nodes:
+            self.ask_nodes(0)
         for actor in (self.policies.source.actor, *self._agents.values()):
             ray.kill(actor)
 
     def placed(self, worker: WorkerId) -> bool:
         return private.is_placed(self._remotes[worker].actor)
+
+    def ask_nodes(self, workers: int) -> None:
+        cluster.ask_nodes(workers, self._cpus)
+        self._asked_nodes = workers > 0
 
     def free_workers(self) -> int:
         return cluster.free_workers(self._cpus)

@@ -10,7 +10,7 @@ from dataclasses import dataclass
 import pyarrow as pa
 import ray
 
-from t6gps.service import threads
+from t6gps.service import provenance, threads
 from t6gps.service.pool.attempt import Failure, Runner, attempt, policy_digest, settings_digest
 from t6gps.service.pool.state import Identity
 from t6gps.service.ray_backend import cluster, processes
@@ -64,7 +64,8 @@ class WorkerActor:
         threads.limit()
         address: str = ray.util.get_node_ip_address()  # type: ignore[no-untyped-call]
         digest = settings_digest(settings.model_dump_json())
-        return Started(Identity(os.getpid(), address, cluster.this_node(), digest), self._process)
+        identity = Identity(os.getpid(), address, cluster.this_node(), digest, provenance.build())
+        return Started(identity, self._process)
 
     def ping(self) -> None:
         """A sign of life."""

@@ -18,7 +18,6 @@ import pyarrow as pa
 from pydantic import JsonValue
 
 from t6gps.service.api.policy import Policy
-from t6gps.service.pool.control import SCALE_DEADLINE_S, Status
 from t6gps.service.remote.connection import Connection, checked
 from t6gps.service.remote.messages import (
     AuditLine,
@@ -34,6 +33,8 @@ from t6gps.service.remote.messages import (
     TokenRequest,
 )
 from t6gps.service.remote.stream import Update
+from t6gps.service.steering.requests import SCALE_DEADLINE_S
+from t6gps.service.steering.status import Status
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
 from t6gps.storage import catalog

@@ -11,20 +11,18 @@ import os
 import signal
 import subprocess
 import sys
-import time
 from collections.abc import Callable, Mapping
 from pathlib import Path
 
 from t6gps.service import config as configuration
-from t6gps.service.pool import control
 from t6gps.service.server.tokens import folder
+from t6gps.service.steering import requests
 from t6gps.service.training import origin, session
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError, T6GpsError
 
 Launch = Callable[[Run], int]
-STOP_DEADLINE_S, TICK_S = 30.0, 0.1
 EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
 _log = logging.getLogger(__name__)
 _children: list[subprocess.Popen[bytes]] = []
@@ -47,44 +45,13 @@ def launch(run: Run) -> int:
     return child.pid
 
 
-def pause(run: Run, deadline_s: float) -> control.Status:
-    """Let a running run go on without workers. RunError where it does not run."""
-    return control.scale(run, 0, deadline_s)
-
-
-def resume(run: Run, start: Launch, deadline_s: float) -> int:
+def resume(run: Run, start: Launch) -> int:
     """Let a paused run have its workers again, or a stopped one a process; its process. RunError where it runs."""
     pid = catalog.process_of(run)
     if pid is None:
         return start(run)
-    if control.status(run)["wanted"]:
-        raise RunError(f"run {run.name} is running already; see t6gps status {run.name}")
-    control.scale(run, configuration.kept(run).run.workers, deadline_s)
+    requests.unpause(run)
     return pid
-
-
-def stop(run: Run, deadline_s: float = STOP_DEADLINE_S) -> None:
-    """Stop a run on this machine as SIGTERM does; everything sampled is kept. RunError where it does not end."""
-    pid = catalog.process_of(run)
-    if pid is None:
-        raise RunError(f"run {run.name} is not running; nothing is to be stopped")
-    if not _holds(pid, run.path / ".lock"):
-        raise RunError(f"run {run.name} is in use by process {pid} of another machine or user; stop it there")
-    os.kill(pid, signal.SIGTERM)
-    deadline = time.monotonic() + deadline_s
-    while catalog.process_of(run) == pid:
-        if time.monotonic() > deadline:
-            raise RunError(f"run {run.name} is told to stop and has not ended after {deadline_s:.0f} s; see its status")
-        time.sleep(TICK_S)
-
-
-def _holds(pid: int, lock: Path) -> bool:
-    """True when that process of this machine has the lock file open: a number alone may be another machine's."""
-    try:
-        opened = list(Path(f"/proc/{pid}/fd").iterdir())
-        return any(descriptor.samefile(lock) for descriptor in opened if descriptor.exists())
-    except OSError:
-        return False
 
 
 class _Diary:

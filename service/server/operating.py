@@ -8,10 +8,11 @@ from http import HTTPStatus
 from fastapi import APIRouter
 
 from t6gps.service import config as configuration
-from t6gps.service.pool import control
 from t6gps.service.remote.messages import ScaleRequest, Started, StartRequest
 from t6gps.service.server import jobs
 from t6gps.service.server.access import REFUSALS, NamedRun, Operation, Place
+from t6gps.service.steering import requests
+from t6gps.service.steering.status import Status
 from t6gps.service.training import session
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
@@ -42,32 +43,32 @@ def start(operation: Operation, request: StartRequest, place: Place) -> Started:
 
 
 @routes.post("/{name}/scale")
-def scale(operation: Operation, run: NamedRun, request: ScaleRequest, place: Place) -> control.Status:
+def scale(operation: Operation, run: NamedRun, request: ScaleRequest, place: Place) -> Status:
     """Give a running run so many workers, and wait until it has them; its status then."""
     operation.update(request.model_dump())
     with place.operating.taken():
-        return control.scale(run, request.workers, request.deadline_s)
+        return requests.scale(run, request.workers, request.deadline_s)
 
 
 @routes.post("/{name}/pause")
-def pause(operation: Operation, run: NamedRun, place: Place) -> control.Status:
+def pause(operation: Operation, run: NamedRun, place: Place) -> Status:
     """Take all workers from a running run; its status then."""
     with place.operating.taken():
-        return jobs.pause(run, control.SCALE_DEADLINE_S)
+        return requests.pause(run)
 
 
 @routes.post("/{name}/resume", status_code=HTTPStatus.ACCEPTED)
 def resume(operation: Operation, run: NamedRun, place: Place) -> Started:
     """Give a paused run its workers, or a stopped run a process."""
     with place.operating.taken():
-        return Started(name=run.name, pid=jobs.resume(run, place.launch, control.SCALE_DEADLINE_S))
+        return Started(name=run.name, pid=jobs.resume(run, place.launch))
 
 
 @routes.post("/{name}/stop", status_code=HTTPStatus.NO_CONTENT)
 def stop(operation: Operation, run: NamedRun, place: Place) -> None:
     """Stop a run, and wait until it has ended; everything sampled is kept."""
     with place.operating.taken():
-        jobs.stop(run)
+        requests.stop(run)
 
 
 def _nothing_to_warn_of(sentence: str) -> None:

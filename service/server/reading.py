@@ -14,10 +14,11 @@ from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
 from t6gps.service.api import policy as policies
-from t6gps.service.pool import control
 from t6gps.service.remote.messages import QueryForm, QueryRequest
 from t6gps.service.server import updates
 from t6gps.service.server.access import REFUSALS, NamedRun, Place, Reading, Slots
+from t6gps.service.steering import status as statuses
+from t6gps.service.steering.status import Status
 from t6gps.service.training import evaluation, summary
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
@@ -48,9 +49,9 @@ def runs(place: Place) -> list[RunSummary]:
 
 
 @routes.get("/{name}/status")
-def status(run: NamedRun) -> control.Status:
+def status(run: NamedRun) -> Status:
     """How a run is: its workers, what is under way, who waits for whom and since when."""
-    return control.status(run)
+    return statuses.status(run)
 
 
 @routes.get("/{name}/metrics")

@@ -17,7 +17,7 @@ from dataclasses import dataclass, field
 
 from anyio import to_thread
 
-from t6gps.service.pool import control
+from t6gps.service.steering import status as statuses
 from t6gps.service.training.summary import iterations
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import T6GpsError
@@ -46,7 +46,7 @@ class Follower:
 
     def _status(self) -> list[str]:
         try:
-            status = control.status(self.run)
+            status = statuses.status(self.run)
         except T6GpsError:  # it never had workers, or is gone; its iterations say the rest
             return []
         condition = json.dumps([status["state"], status["reason"], status["phase"], status["wanted"], status["ready"]])

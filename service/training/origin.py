@@ -24,8 +24,6 @@ from t6gps.workers.ground.ground import ground
 from t6gps.workers.settings import TerrainSettings
 
 FILE = "origin.json"
-SHORT_N = 12
-"""Digits of a digest that tell two apart in a message."""
 
 
 class Ground(BaseModel):
@@ -106,10 +104,10 @@ def at_work(config: Config, run: Run) -> Config:
     copy = run.path / origin.ground.file
     found = _digest(copy)
     if found != origin.ground.sha256:
-        state = "missing" if found is None else f"altered: its SHA-256 is {found[:SHORT_N]}"
+        state = "missing" if found is None else f"altered: its SHA-256 is {found[: provenance.SHORT_N]}"
         raise RunError(
             f"run {run.name} is not whole: its ground {copy} is {state}, {FILE} has "
-            f"{origin.ground.sha256[:SHORT_N]}; restore the file from a copy"
+            f"{origin.ground.sha256[: provenance.SHORT_N]}; restore the file from a copy"
         )
     return configuration.with_ground(config, copy)
 
@@ -129,11 +127,11 @@ def differences(run: Run, config: Config) -> list[str]:
     found = _digest(Path(file))
     if found == origin.ground.sha256 or (found is None and file == stored.terrain.file):
         return others
-    content = "cannot be read" if found is None else f"holds other ground, SHA-256 {found[:SHORT_N]}"
+    content = "cannot be read" if found is None else f"holds other ground, SHA-256 {found[: provenance.SHORT_N]}"
     return [
         *others,
         f"terrain.file = {file} {content} (the run has {stored.terrain.file}, SHA-256 "
-        f"{origin.ground.sha256[:SHORT_N]}, and keeps it as {run.path / origin.ground.file})",
+        f"{origin.ground.sha256[: provenance.SHORT_N]}, and keeps it as {run.path / origin.ground.file})",
     ]
 
 
@@ -160,7 +158,7 @@ def changes(run: Run) -> str | None:
 
 def _named(origin: Origin) -> dict[str, str]:
     """Everything that data may depend on, by names for people."""
-    compiled = {f"compiled {name}": digest[:SHORT_N] for name, digest in origin.compiled.items()}
+    compiled = {f"compiled {name}": digest[: provenance.SHORT_N] for name, digest in origin.compiled.items()}
     return {**origin.versions, "commit": origin.commit, **compiled}
 
 

@@ -15,6 +15,7 @@ from t6gps.service.checks import Wanted
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
 from t6gps.service.pool.state import RunState
+from t6gps.service.steering.watch import heeding
 from t6gps.service.training import evaluation, loop, origin
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.loop import Observer
@@ -105,17 +106,20 @@ def tell_changes(run: Run, warn: Warn) -> None:
 def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
     """Train what is missing of a run, evaluate its policy without noise, and keep the result.
 
-    Everything sampled is kept when KeyboardInterrupt comes. A run is removed whose first executor does not start.
+    Everything sampled is kept when KeyboardInterrupt comes, also by `t6gps stop`. A run is removed whose first executor
+    does not start.
     """
     with catalog.locked(run), _named(run):
         config = origin.at_work(config, run)
         try:
-            started = start_executor(config, serial, run)
+            with heeding(run):
+                started = start_executor(config, serial, run)
         except BaseException:
             catalog.discard_unused(run)
             raise
         with closing(started) as executor:
-            result = train_and_evaluate(config, run, executor, observer)
+            with heeding(run):
+                result = train_and_evaluate(config, run, executor, observer)
             executor.close(RunState.DONE)
         evaluation.keep(run, result)
         return result

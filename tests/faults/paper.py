@@ -2,16 +2,16 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
 from t6gps.service.pool.attempt import Failure, FailureKind
-from t6gps.service.pool.control import Control
 from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.decision_log import DecisionLog
 from t6gps.service.pool.ledger import Ledger
-from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
+from t6gps.service.pool.messages import Alive, Died, Instruction, Observation, PostMortem, Ready, ScaleRequested
+from t6gps.service.pool.outside import Nobody, Outside, Situation
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.scaling import PLANS_PER_WORKER
 from t6gps.service.pool.state import (
@@ -20,6 +20,8 @@ from t6gps.service.pool.state import (
     WorkerId,
 )
 from t6gps.service.pool.transport import Done, Report, Transport
+from t6gps.service.steering import events
+from t6gps.service.steering.events import Happened, Standing
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers import stub
 
@@ -53,13 +55,14 @@ class Paper(Transport):
         self.reports: list[Report] = []
         self.fails_to_start = False
         self.hold_back = False
-        self.settings = SETTINGS
+        self.settings, self.build = SETTINGS, dict[str, str]()
         self.digest = "policy"
         self.episode_s = EPISODE_S
         self.raising: set[int] = set()
         self.hanging: set[int] = set()
         self.crashing: set[int] = set()
         self.silent: set[WorkerId] = set()
+        self.nodes_asked: list[int] = []
         self.most_in_flight = 0
         self.polls_n = 0
 
@@ -95,7 +98,9 @@ class Paper(Transport):
                     self.die(worker)
                     continue
                 paper.ready = True
-                self.reports.append(Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings)))
+                self.reports.append(
+                    Ready(worker, Identity(1000 + worker.slot, "paper", "paper", self.settings, self.build))
+                )
             while paper.queue and self.now_s >= paper.until_s:
                 if paper.queue[0].episode_id in self.hanging:
                     break
@@ -123,6 +128,9 @@ class Paper(Transport):
     def placed(self, worker: WorkerId) -> bool:
         return list(self.alive).index(worker) < self.room
 
+    def ask_nodes(self, workers: int) -> None:
+        self.nodes_asked.append(workers)
+
     def free_workers(self) -> int:
         return max(self.room - len(self.alive), 0)
 
@@ -132,16 +140,22 @@ class Paper(Transport):
         self.reports.append(Died(worker, error, "the process ended"))
 
 
-class Requests(Control):
-    """Control without files."""
+class Asker(Nobody):
+    """Asks for what it is told to, and keeps what it hears: events, and the condition at the end."""
 
     def __init__(self) -> None:
-        super().__init__(None, 100)
-        self.asked: int | None = None
+        self.requests: list[Observation] = []
+        self.happened: list[Happened] = []
+        self._standing: Standing | None = None
 
-    def scale_request(self) -> int | None:
-        asked, self.asked = self.asked, None
+    def asked(self) -> list[Observation]:
+        asked, self.requests = self.requests, []
         return asked
+
+    def decided(self, situation: Situation, observed: Sequence[Observation], decided: Sequence[Instruction]) -> None:
+        before, after = self._standing or Standing(situation.state.wanted), events.standing(situation.state)
+        self.happened += events.of(before, after, situation.state, observed, decided)
+        self._standing = after
 
 
 class House:
@@ -154,12 +168,13 @@ class House:
         autoscale: tuple[int, int] | None = None,
         bytes_in_flight: int = 2**30,
         log: DecisionLog | None = None,
+        outside: Outside | None = None,
     ) -> None:
-        self.paper, self.ledger, self.requests = Paper(), Ledger(), Requests()
+        self.paper, self.ledger, self.asker = Paper(), Ledger(), Asker()
         self.quarantined: list[EpisodePlan] = []
         times = EpisodeTimes(SHORTEST_S)
         state = PoolState(wanted, SETTINGS, self.ledger, TIMINGS, times, autoscale, bytes_in_flight=bytes_in_flight)
-        self.pool = Pool(state, self.paper, self.requests, self.quarantined.append, log, self.paper.clock)
+        self.pool = Pool(state, self.paper, outside or self.asker, self.quarantined.append, log, self.paper.clock)
         self.pool.open(plans(episodes), [], {0: "policy"})
 
     def run(self, seconds: float) -> None:
@@ -178,7 +193,11 @@ class House:
 
     @property
     def ready(self) -> int:
-        return int(self.pool.status()["ready"])
+        return sum(worker.ready for worker in self.pool.state.workers.values())
+
+    def scale(self, workers: int) -> None:
+        """Ask for so many workers, at the next tick."""
+        self.asker.requests.append(ScaleRequested(workers))
 
     def sample(self, after_each: Callable[[list[int]], None] = lambda _: None) -> list[int]:
         """Numbers of the episodes in the order of their arrival; `after_each` sees those that there are so far."""

@@ -2,8 +2,8 @@
 
     python tests/faults/starts.py [--json] [PATTERN]
 
-Starts a small training under each condition whose name holds PATTERN, and stops one in each of its phases, by SIGTERM
-and by Ctrl-C.
+Starts a small training under each condition whose name holds PATTERN. Stops one in each of its phases, by SIGTERM, by
+Ctrl-C and by `t6gps stop`.
 Prints what came of it and how long it took; with --json as docs/figures/starts.json has it. Conditions that this
 machine cannot make are passed over with a word. `test_starts.py` runs some of them.
 """
@@ -29,6 +29,8 @@ from pathlib import Path
 
 from t6gps.service import provenance
 from t6gps.service.ray_backend import processes
+from t6gps.service.steering import requests
+from t6gps.storage import catalog
 
 DEADLINE_S, STOP_DEADLINE_S, GONE_DEADLINE_S = 60.0, 5.0, 10.0
 """For a refusal; for a stop; for the last process of a run that has ended."""
@@ -245,7 +247,8 @@ def has_process(name: str) -> Callable[[str, Path], bool]:
     return lambda mark, _: any(name in processes.command(pid) for pid in marked(mark))
 
 
-STOPS = {"SIGTERM": signal.SIGTERM, "Ctrl-C": signal.SIGINT}
+CLOSING = "while it closes and draws"
+"""The run is done, and only its process is not: there is nothing left for `t6gps stop`."""
 PHASES: dict[str, Callable[[str, Path], bool]] = {
     "while Ray starts": has_process("gcs_server"),
     "while the policy server and the workers start": has_process("ray::"),
@@ -253,13 +256,20 @@ PHASES: dict[str, Callable[[str, Path], bool]] = {
     "while episodes are sampled": lambda _, run: any(run.glob("spool/*/episode-*")),
     "while the learner works": lambda _, run: any(run.glob("checkpoints/*1*")),
     "during the evaluation": lambda _, run: any(run.glob("checkpoints/*2*")),
-    "while it closes and draws": lambda _, run: (run / "evaluation.json").exists(),
+    CLOSING: lambda _, run: (run / "evaluation.json").exists(),
 }
 
 
-def stop(phase: str, how: str, folder: Path) -> Outcome:
-    """Stop a training in a phase by one of STOPS, and judge how it ends."""
-    condition, name = Condition(phase), f"{how} {phase}"
+WAYS: dict[str, Callable[[subprocess.Popen[bytes], Path], object]] = {
+    "SIGTERM": lambda process, _: process.send_signal(signal.SIGTERM),
+    "Ctrl-C": lambda process, _: process.send_signal(signal.SIGINT),
+    "t6gps stop": lambda _, run: requests.stop(catalog.Run(run)),
+}
+
+
+def stop(way: str, phase: str, folder: Path) -> Outcome:
+    """Stop a training in a phase, and judge how it ends."""
+    condition, name = Condition(phase), f"{way} {phase}"
     with launched(condition, folder) as (process, mark):
         deadline = time.monotonic() + PATIENCE_S
         while not PHASES[phase](mark, folder / "runs" / "one"):
@@ -267,7 +277,7 @@ def stop(phase: str, how: str, folder: Path) -> Outcome:
                 return Outcome(name, "", 0.0, "the phase never came: " + (folder / "said").read_text()[-1500:])
             time.sleep(0.005)
         sent_s = time.monotonic()
-        process.send_signal(STOPS[how])
+        WAYS[way](process, folder / "runs" / "one")
         try:
             code = process.wait(DEADLINE_S)
         except subprocess.TimeoutExpired:
@@ -288,9 +298,9 @@ def outcomes(pattern: str) -> Iterator[Outcome]:
             print(f"{condition.name}: this machine cannot make it ({condition.needs})", file=sys.stderr)
             continue
         yield in_folder(lambda folder, condition=condition: start(condition, folder))
-    for phase, how in product(PHASES, STOPS):
-        if pattern in f"{how} {phase}":
-            yield in_folder(lambda folder, phase=phase, how=how: stop(phase, how, folder))
+    for way, phase in product(WAYS, PHASES):
+        if pattern in f"{way} {phase}" and (way, phase) != ("t6gps stop", CLOSING):
+            yield in_folder(lambda folder, way=way, phase=phase: stop(way, phase, folder))
 
 
 def in_folder(judge: Callable[[Path], Outcome]) -> Outcome:

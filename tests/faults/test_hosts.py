@@ -22,7 +22,7 @@ from job import CONFIG
 
 from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.pool import control
+from t6gps.service.steering import status as statuses
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.spool import Spool
@@ -180,7 +180,7 @@ def test_t16_a_run_goes_on_without_a_host_that_is_cut_off_and_with_it_when_it_is
     def status() -> dict[str, Any]:
         assert job.poll() is None, hosts.output(job)
         try:
-            return control.status(run)
+            return statuses.status(run)
         except RunError:
             return {"workers": [], "episodes": {"committed": 0}}
 
@@ -199,7 +199,7 @@ def test_t16_a_run_goes_on_without_a_host_that_is_cut_off_and_with_it_when_it_is
     (tmp_path / "enough").touch()
     assert job.wait(300) == 0, hosts.output(job)
     assert cut > before
-    config, ended = Config.model_validate(CONFIG), control.status(run)
+    config, ended = Config.model_validate(CONFIG), statuses.status(run)
     batches = sorted(run.spool.iterdir())
     assert ended["state"] == "DONE"
     assert ended["episodes"]["committed"] == len(batches) * config.run.episodes

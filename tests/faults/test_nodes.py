@@ -18,9 +18,9 @@ import ray
 from house import QUICK, House, add_node, others, pid, three_nodes
 from ray.cluster_utils import Cluster
 
-from t6gps.service.pool import control
 from t6gps.service.pool.state import Worker
 from t6gps.service.ray_backend import cluster
+from t6gps.service.steering import requests
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -106,7 +106,7 @@ def test_a_node_that_joins_gets_workers_when_more_are_asked_for(house: House, no
 
     def scale() -> None:
         try:
-            answers.append(control.scale(house.run, 4, 300)["ready"])
+            answers.append(requests.scale(house.run, 4, 300)["ready"])
         except RunError as error:  # told by the main thread
             answers.append(error)
 

@@ -87,10 +87,8 @@ class Soak:
             return
         self.faults[fault] += 1
         if fault == "scale":
-            request = {"id": str(now), "workers": int(self.rng.integers(1, 4))}
-            path = self.run.pool / "scale_request.json"
-            durable.hidden(path).write_text(json.dumps(request))
-            durable.publish(path)
+            request = {"id": str(now), "what": "workers", "workers": int(self.rng.integers(1, 4))}
+            durable.replace(self.run.request, json.dumps(request).encode())
             self.executor.pool.tick()  # it has seen the request
             self._under_way = fault, -1, -1, now
             return

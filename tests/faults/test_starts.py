@@ -5,7 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 import pytest
-from starts import CONDITIONS, STOPS, Condition, possible, start, stop
+from starts import CONDITIONS, WAYS, Condition, possible, start, stop
 
 
 @pytest.mark.slow
@@ -17,7 +17,7 @@ def test_a_start_trains_or_says_why_and_leaves_nothing(condition: Condition, tmp
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize("how", STOPS)
-def test_a_stop_while_ray_starts_is_heeded_and_leaves_nothing(how: str, tmp_path: Path) -> None:
-    outcome = stop("while Ray starts", how, tmp_path)
+@pytest.mark.parametrize("way", WAYS)
+def test_a_stop_while_ray_starts_is_heeded_and_leaves_nothing(way: str, tmp_path: Path) -> None:
+    outcome = stop(way, "while Ray starts", tmp_path)
     assert (outcome.wrong, outcome.said) == ("", "ends, and leaves no run")

@@ -21,13 +21,15 @@ import ray
 from house import CONFIG, House, joining, pid, policy
 
 from t6gps.service.config import Config, parse
-from t6gps.service.pool import control, crash_bundle
+from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.attempt import policy_digest
 from t6gps.service.pool.ledger import FAILURES_ALLOWED_N
 from t6gps.service.pool.state import RunState, Worker
 from t6gps.service.ray_backend import processes
 from t6gps.service.ray_backend.policy_server import VERSIONS_HELD_N
 from t6gps.service.ray_backend.processes import Process
+from t6gps.service.steering import requests
+from t6gps.service.steering import status as statuses
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode
@@ -181,7 +183,7 @@ def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: 
     def scale() -> None:
         try:
             for request in (1, 3, 1, 2):
-                assert control.scale(house.run, request, 240)["ready"] == request
+                assert requests.scale(house.run, request, 240)["ready"] == request
                 reached.append(request)
         except Exception as error:  # told by the main thread
             failed.append(error)
@@ -197,10 +199,10 @@ def test_t6_scaling_while_sampling_reaches_its_request_and_loses_nothing(house: 
 
 
 def test_a_request_that_is_not_allowed_changes_nothing(house: House) -> None:
-    most = control.status(house.run)["most"]
+    most = statuses.status(house.run)["most"]
     for request in (-1, most + 1):
         with pytest.raises(RunError, match=f"workers must lie in 0 .. {most}"):
-            control.scale(house.run, request)
+            requests.scale(house.run, request)
     assert house.executor.pool.state.wanted == 2
 
 
@@ -273,7 +275,7 @@ def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(ho
         while time.monotonic() < end_s:
             pool.tick(0.05)
             most = max(most, len(ledger.leases) + ledger.arrived)
-            bytes_ = max(bytes_, int(pool.status()["bytes_in_flight"]))
+            bytes_ = max(bytes_, int(statuses.describe(pool.situation())["bytes_in_flight"]))
 
     sampled = house.sample(pause)
     assert most == 4
@@ -321,7 +323,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
     def told(condition: Callable[[dict[str, Any]], bool]) -> Callable[[], bool]:
         def holds() -> bool:
             house.executor.pool.tick(0.02)
-            return condition(control.status(house.run))
+            return condition(statuses.status(house.run))
 
         return holds
 
@@ -329,7 +331,7 @@ def test_status_names_the_workers_what_is_under_way_and_who_waits(
         if len(sampled) > 1:
             return
         wait_until(told(lambda status: status["leases"] + status["arrived"] == 4), 240)  # with the one not kept yet
-        status = control.status(house.run)
+        status = statuses.status(house.run)
         assert (status["state"], status["ready"], status["wanted"], status["backlog"]) == ("RUNNING", 2, 2, 30)
         pids = {(worker.id.slot, pid(worker)) for worker in house.workers}
         assert {(worker["slot"], worker["pid"]) for worker in status["workers"]} == pids

@@ -74,6 +74,17 @@ def test_a_root_that_is_a_file_or_in_one_is_named(tmp_path: Path) -> None:
         assert finding.remedy
 
 
+def test_a_root_in_a_session_folder_of_ray_is_refused_also_by_way_of_a_link(tmp_path: Path) -> None:
+    session = tmp_path / "session_2026-11-27_16-36-18_123456_789"
+    (session / "runtime_resources").mkdir(parents=True)
+    (tmp_path / "session_latest").symlink_to(session)
+    for place in (session, tmp_path / "session_latest"):
+        finding = checks.root_folder(Wanted(1, place / "runtime_resources" / "runs"))
+        assert finding.stops
+        assert "--root elsewhere" in finding.remedy
+    assert checks.root_folder(Wanted(1, tmp_path / "session_of_mine")).good
+
+
 def test_a_root_that_is_yet_to_be_made_is_good_where_it_can_be_and_is_not_made_by_looking(tmp_path: Path) -> None:
     root = tmp_path / "a" / "b"
     assert checks.root_folder(Wanted(1, root)).good

@@ -6,7 +6,8 @@ import platform
 from datetime import UTC, datetime, timedelta
 from importlib import metadata
 
-from t6gps.service.provenance import provenance, versions
+from t6gps.service.provenance import COMPILED, build, differences, provenance, versions
+from t6gps.storage.schema import SCHEMA_VERSION
 
 
 def test_provenance_is_of_this_process_and_of_now() -> None:
@@ -20,3 +21,17 @@ def test_provenance_is_of_this_process_and_of_now() -> None:
 def test_versions_name_what_the_data_of_an_episode_depend_on() -> None:
     assert versions()["pybullet"] == metadata.version("pybullet")
     assert versions()["python"] == platform.python_version()
+
+
+def test_a_build_names_versions_schema_and_each_compiled_module() -> None:
+    found = build()
+    assert found["t6gps"] == metadata.version("t6gps")
+    assert found["schema"] == str(SCHEMA_VERSION)
+    assert {f"compiled {name}" for name in COMPILED} <= found.keys()
+
+
+def test_differences_name_what_is_missing_on_either_side() -> None:
+    assert differences(build(), build()) == ""
+    assert differences({"a": "1", "b": "2"}, {"b": "3", "c": "4"}) == (
+        "b 2 (the run: 3), c none (the run: 4), a 1 (the run: none)"
+    )

@@ -14,13 +14,13 @@ import ray
 from house import joining
 
 from t6gps.learner.phases import PHASES
-from t6gps.service import seeding
+from t6gps.service import provenance, seeding
 from t6gps.service.config import load
 from t6gps.service.execution.ray_executor import RayExecutor
-from t6gps.service.execution.ray_learner import EPISODES_PER_CALL_N, EPISODES_UNDER_WAY_N
+from t6gps.service.execution.ray_learner import EPISODES_PER_CALL_N, EPISODES_UNDER_WAY_N, as_at_home
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.service.pool.deadlines import Timings
-from t6gps.storage.errors import LearnerDiedError
+from t6gps.storage.errors import LearnerDiedError, RunError
 from t6gps.storage.records import Episode
 
 SETTINGS = ["run.episodes=60", "run.steps=10", "learner.smallest_class_segments=4", "learner.epochs=1"]
@@ -84,3 +84,10 @@ def test_t10_a_learner_that_hangs_is_ended_and_another_one_takes_its_place(ray_h
         again = executor.learner.policy()
     for (weight, _), (before, _) in zip(again.layers, untrained.layers, strict=True):
         assert (weight == before).all()
+
+
+def test_a_fit_on_a_node_with_another_installation_is_refused() -> None:
+    build = provenance.build()
+    assert as_at_home(len, build)("abc") == 3
+    with pytest.raises(RunError, match=r"node \S+ has another installation than the run: t6gps \S+ \(the run: 0.0\)"):
+        as_at_home(len, build | {"t6gps": "0.0"})("abc")

@@ -20,7 +20,7 @@ def test_what_was_decided_under_faults_is_decided_again_from_the_log(tmp_path: P
 
     def disturb(found: list[int]) -> None:
         if len(found) == 20:
-            house.requests.asked = 4
+            house.scale(4)
         if len(found) == 40:
             house.paper.die(next(iter(house.paper.alive)))
 

@@ -17,6 +17,7 @@ from t6gps.service.pool.state import (
     WorkerPhase,
 )
 from t6gps.service.pool.supervisor import GRACE_S
+from t6gps.service.steering import status
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import EpisodePlan
 
@@ -196,9 +197,9 @@ def test_an_episode_that_always_raises_is_quarantined_after_three_failures_and_t
     house.paper.raising.add(5)
     assert sorted(house.sample()) == [n for n in range(12) if n != 5]
     assert [plan.episode_id for plan in house.quarantined] == [5]
-    status = house.pool.status()
-    assert status["quarantined"] == [5]
-    assert status["episodes"]["failures"] == 3
+    found = status.describe(house.pool.situation())
+    assert found["quarantined"] == [5]
+    assert found["episodes"]["failures"] == 3
 
 
 def test_an_episode_that_kills_its_worker_three_times_is_quarantined() -> None:
@@ -225,7 +226,8 @@ def test_scaling_reaches_what_was_asked_while_sampling_and_loses_nothing() -> No
     def scale(_: list[int]) -> None:
         nonlocal asked_s
         if not asked_s:
-            house.requests.asked, asked_s = requests_left[0], house.paper.now_s
+            house.scale(requests_left[0])
+            asked_s = house.paper.now_s
         assert house.paper.now_s - asked_s <= 5
         if house.ready == requests_left[0] == len(house.pool.state.workers) and len(requests_left) > 1:
             requests_left.pop(0)
@@ -243,7 +245,7 @@ def test_a_draining_worker_finishes_its_episode_and_hands_the_other_back() -> No
     house = House(2, 10)
     house.until(lambda: all(len(w.plans) == 2 for w in house.pool.state.workers.values()) and house.ready == 2, 5)
     kept, given = house.pool.state.workers[1].plans
-    house.requests.asked = 1
+    house.scale(1)
     house.pool.tick()
     assert house.pool.state.workers[1].phase == WorkerPhase.DRAINING
     assert list(house.pool.state.workers[1].plans) == [kept]
@@ -258,10 +260,10 @@ def test_scaled_to_nothing_a_run_pauses_and_goes_on_when_it_is_scaled_up() -> No
 
     def pause(found: list[int]) -> None:
         if len(found) == 1:
-            house.requests.asked = 0
+            house.scale(0)
             house.until(lambda: not house.pool.state.workers, 5)
             assert house.pool.state.condition == "PAUSED"
-            house.requests.asked = 1
+            house.scale(1)
 
     assert sorted(house.sample(pause)) == list(range(10))
 
@@ -270,7 +272,7 @@ def test_a_worker_that_waits_for_a_cpu_is_named_and_comes_when_there_is_one() ->
     house = House(1, 0)
     house.paper.room = 1
     house.until(lambda: house.ready == 1, 5)
-    house.requests.asked = 2
+    house.scale(2)
     house.run(5)
     assert house.pool.state.condition == "DEGRADED"
     assert "1 wait for a CPU" in house.pool.state.reason
@@ -295,10 +297,36 @@ def test_autoscaling_follows_the_backlog_and_the_room() -> None:
     assert house.ready == 1
 
 
-def test_a_worker_with_other_settings_or_another_policy_ends_the_run() -> None:
+def test_autoscaling_asks_for_the_room_that_it_lacks_and_gives_it_back() -> None:
+    house = House(1, 40, autoscale=(1, 4))
+    house.paper.room = 1
+
+    def watch(found: list[int]) -> None:
+        if len(found) == 1:
+            assert house.paper.nodes_asked == [4]
+            assert house.ready == 1
+            house.paper.room = 4  # the cluster has grown
+            house.until(lambda: house.ready == 4, 5)
+
+    house.sample(watch)
+    assert house.paper.nodes_asked == [4]  # as long as the workers are there
+    house.run(TIMINGS.shrink_after_s + 2)
+    assert house.paper.nodes_asked == [4, 1]
+    house.scale(2)
+    house.pool.tick()
+    assert house.paper.nodes_asked == [4, 1, 0]  # scaled by hand, workers that wait for a CPU ask for it themselves
+
+
+def test_a_worker_with_other_settings_another_installation_or_another_policy_ends_the_run() -> None:
     house = House(1, 3)
     house.paper.settings = "others"
     with pytest.raises(RunError, match="other settings"):
+        house.run(5)
+    house = House(1, 3)
+    house.pool.state.build = {"t6gps": "0.3", "schema": "5", "compiled learner._backward": "aa"}
+    house.paper.build = {"t6gps": "0.3", "schema": "4"}
+    differences = r"schema 4 \(the run: 5\), compiled learner._backward none \(the run: aa\)"
+    with pytest.raises(RunError, match=rf"on node paper has another installation than the run: {differences}; install"):
         house.run(5)
     house = House(1, 3)
     house.paper.digest = "another"

@@ -9,7 +9,8 @@ from pathlib import Path
 
 import pytest
 
-from t6gps.service.pool import control
+from t6gps.service.steering import requests
+from t6gps.service.steering import status as statuses
 from t6gps.storage import catalog
 from t6gps.storage.errors import RunError
 
@@ -71,10 +72,10 @@ def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behi
         family = descendants(started.pid)
         assert listeners(family)
         assert listeners(family) <= set(LOOPBACK)
-        os.kill(control.status(run)["workers"][0]["pid"], signal.SIGKILL)
+        os.kill(statuses.status(run)["workers"][0]["pid"], signal.SIGKILL)
         before = spooled()
         wait_until(lambda: spooled() >= before + 5, 240)
-        assert control.status(run)["processes"]["crashed"] == 1
+        assert statuses.status(run)["processes"]["crashed"] == 1
         family = descendants(started.pid)
         for _ in range(2):  # the second stop does nothing
             started.send_signal(signal.SIGTERM)
@@ -85,7 +86,7 @@ def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behi
     assert b"--resume" in message
     assert b"Traceback" not in message
     wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 60)
-    assert control.status(run)["state"] == "STOPPED"
+    assert statuses.status(run)["state"] == "STOPPED"
     with pytest.raises(RunError, match=r"not running \(STOPPED.*--resume"):
-        control.scale(run, 2)
-    assert not (run.pool / "scale_request.json").exists()
+        requests.scale(run, 2)
+    assert not run.request.exists()

@@ -1,0 +1,143 @@
+"""How a running run tells how it is: RUN/pool/status.json, written by its process.
+
+It is written at most every PUBLISH_S, and when the run's condition changes. Reading it takes no permission to write.
+"""
+
+from __future__ import annotations
+
+import json
+import os
+import time
+
+from typing_extensions import TypedDict  # pydantic cannot check those of `typing` before Python 3.12
+
+from t6gps.service.pool.outside import Situation
+from t6gps.service.pool.state import RunState, Worker, WorkerPhase
+from t6gps.storage import catalog, durable
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
+
+PUBLISH_S = 0.5
+ENDED = (RunState.DONE, RunState.FAILED)
+
+
+class WorkerStatus(TypedDict):
+    """A worker's line; ages in seconds."""
+
+    slot: int
+    incarnation: int
+    pid: int | None
+    node: str | None
+    phase: str
+    for_s: float
+    episodes: list[int]
+
+
+class Wait(TypedDict):
+    """Somebody waits for somebody."""
+
+    what: str
+    for_s: float
+
+
+class Status(TypedDict, total=False):
+    """How a run is. `ready` of `wanted` workers take plans; `most` may be asked for.
+
+    request           id of the last request that was taken
+    backlog           episodes of the batch that are neither durable nor quarantined
+    leases, arrived   of these, with a worker, and back but not durable
+    episodes          counts of the whole run, by `ledger.COUNTERS`;   processes    of workers
+    """
+
+    time_s: float
+    pid: int
+    request: str | None
+    most: int
+    state: str
+    reason: str
+    phase: str
+    wanted: int
+    ready: int
+    workers: list[WorkerStatus]
+    backlog: int
+    leases: int
+    arrived: int
+    bytes_in_flight: int
+    waits: list[Wait]
+    quarantined: list[int]
+    episodes: dict[str, int]
+    processes: dict[str, int]
+
+
+def describe(situation: Situation) -> Status:
+    """The status that a pool's situation makes."""
+    state, now, waits_since_s = situation.state, situation.now_s, situation.waits_since_s
+    ledger, workers = state.ledger, list(state.workers.values())
+    idle_s = [now - worker.since_s for worker in workers if worker.phase is WorkerPhase.IDLE]
+    waits: list[Wait] = [{"what": what, "for_s": round(now - since_s, 3)} for what, since_s in waits_since_s.items()]
+    if idle_s and not ledger.waiting:
+        waits.append({"what": f"{len(idle_s)} workers wait for plans", "for_s": round(min(idle_s), 3)})
+    under_way_n = len(ledger.leases) + ledger.arrived
+    return {
+        "state": state.condition,
+        "reason": state.reason,
+        "phase": situation.phase,
+        "wanted": state.wanted,
+        "ready": sum(worker.ready for worker in workers),
+        "workers": [_describe_worker(worker, now) for worker in workers],
+        "backlog": ledger.backlog,
+        "leases": len(ledger.leases),
+        "arrived": ledger.arrived,
+        "bytes_in_flight": under_way_n * state.largest_bytes,
+        "waits": waits,
+        "quarantined": sorted(ledger.quarantined),
+        "episodes": dict(ledger.counters),
+        "processes": dict(state.counters),
+    }
+
+
+def _describe_worker(worker: Worker, now: float) -> WorkerStatus:
+    return {
+        "slot": worker.id.slot,
+        "incarnation": worker.id.incarnation,
+        "pid": worker.identity.pid if worker.identity else None,
+        "node": worker.identity.node if worker.identity else None,
+        "phase": worker.phase,
+        "for_s": round(now - worker.since_s, 3),
+        "episodes": [plan.episode_id for plan in worker.plans],
+    }
+
+
+def publish(run: Run, status: Status, request: str | None, most: int) -> None:
+    """Replace a run's status in one step. It need not survive a crash: then it would be wrong."""
+    path = run.pool / "status.json"
+    path.parent.mkdir(exist_ok=True)
+    known = {"time_s": time.time(), "pid": os.getpid(), "request": request, "most": most}
+    draft = durable.hidden(path)
+    draft.write_text(json.dumps({**known, **status}) + "\n")
+    draft.replace(path)
+
+
+def status(run: Run) -> Status:
+    """The newest status of a run, with `for_s` counted up to now.
+
+    What a process left behind that has ended without a word is said to be STOPPED. RunError when the run has none.
+    """
+    path = run.pool / "status.json"
+    try:
+        newest: Status = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise RunError(
+            f"run {run.name} has no status: it was never run with workers; start it with t6gps train"
+        ) from None
+    except (OSError, ValueError) as error:
+        raise RunError(f"cannot read {path}: {error}; resume the run, which writes it anew") from None
+    if newest["state"] in ENDED:
+        return newest
+    if catalog.process_of(run) != newest["pid"]:
+        reason = "its process has ended; resume with --resume"
+        return {**newest, "state": RunState.STOPPED, "reason": reason, "workers": []}
+    age_s = time.time() - newest["time_s"]
+    for entry in (*newest["workers"], *newest["waits"]):
+        entry["for_s"] += age_s
+    return newest
