@@ -109,10 +109,10 @@ def stop(
     ),
 ) -> None:
     """Stop a run as Ctrl-C does, and end the job that does not stop. Everything sampled is kept."""
-    job = records.find(root, name)
-    if job is None:
+    if records.find(root, name) is None and catalog.exists(root, name):
         typer.echo(f"run {name}: {requests.stop(catalog.open_run(root, name), deadline_s)}")
         return
+    job = submission.named(root, name)
     launcher = launchers.serving(job)
     state, _ = launcher.state(job)
     if state in ENDED:

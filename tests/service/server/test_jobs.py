@@ -44,7 +44,7 @@ def test_a_run_is_started_scaled_stopped_and_resumed_from_afar(
 
     try:
         wait_until(sampled, 240)
-        with pytest.raises(RunError, match="running already"):
+        with pytest.raises(RunError, match="is not paused"):
             client.resume("far")
         assert client.pause("far")["ready"] == 0
         assert client.resume("far").pid == catalog.process_of(run)
