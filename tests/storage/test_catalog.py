@@ -98,7 +98,7 @@ def test_runs_that_processes_create_at_once_are_whole_and_each_its_creators_own(
         for process in processes:
             ending.enter_context(process)
             ending.callback(process.stdin.close)  # type: ignore[union-attr]
-        for number in range(12):
+        for number in range(50):
             root = tmp_path / str(number)
             for process in processes:
                 print(root, file=process.stdin)
