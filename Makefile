@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch] */*/*/nati
 train: install
 	$(BIN)/t6gps train flat-quick
 
-# All tests, ten minutes on two cores; then those that need neither Ray nor a trained run, a minute.
+# All tests, thirteen minutes on two cores; then those that need neither Ray nor a trained run, two minutes.
 test: install
 	$(BIN)/pytest $(SPREAD)
 
