@@ -18,6 +18,7 @@ from ray.experimental.internal_kv import _internal_kv_get
 from t6gps.storage import catalog
 from t6gps.storage.records import Episode
 
+# What was asked of Ray has no public reader: the test reads it where an autoscaler does.
 CPUS_PER_WORKER = 0.5
 CONFIG = {
     "run": {
