@@ -22,7 +22,7 @@ from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Folder
-from t6gps.service.launch.job import OUTCOMES, Job, JobState, outcome
+from t6gps.service.launch.job import OUTCOMES, Job, JobState
 from t6gps.service.launch.target import Ray
 from t6gps.service.launch.visible import VisibleLauncher
 from t6gps.service.ray_backend import jobs_api
@@ -72,28 +72,28 @@ class RayLauncher(VisibleLauncher):
                 f"{root} is not the same folder on the cluster {self.target.address}; give a --root that both see, or "
                 "name the cluster's own by ray.root in the file of targets"
             )
-        _check(survey, config, root)
+        judge(survey, config, root)
         if self.target.root is not None:
             self._place(config, folders)
         return self._started(folders)
 
     def state(self, job: Job) -> tuple[JobState, str]:
         known = self.api.details(job.native_id)
-        if known is None and self.target.root is None:
-            return outcome(job.folder)
         if known is None:
-            return JobState.FAILED, f"{self.target.address} has forgotten it, restarted perhaps; resume with --resume"
+            code = job.folder.exit_code if self.target.root is None else None
+            forgotten = f"{self.target.address} knows it no longer, restarted perhaps; resume with --resume"
+            return (OUTCOMES[code], "") if code in OUTCOMES else (JobState.FAILED, forgotten)
         if known.status in STATES:
             return STATES[known.status], known.message or "" if known.status == "PENDING" else ""
         code = known.driver_exit_code
         if code in OUTCOMES:
             return OUTCOMES[code], ""
-        lines = [line.strip() for line in self.api.log(job.native_id).splitlines() if line.strip()]
-        return JobState.FAILED, lines[-1] if code is not None and lines else known.message or "ended without a word"
+        words = "" if code is None else jobs_api.last_words(self.api.log(job.native_id).splitlines())
+        return JobState.FAILED, words or known.message or "ended without a word; resume with --resume"
 
     def logs(self, job: Job, follow: bool) -> Iterator[str]:
         if self.api.details(job.native_id) is None:
-            raise RunError(f"{self.target.address} has forgotten job {job.name}, and its log; see t6gps jobs")
+            raise RunError(f"{self.target.address} knows job {job.name} no longer, nor its log; see t6gps jobs")
         return self.api.follow(job.native_id) if follow else iter([self.api.log(job.native_id)])
 
     def stop(self, job: Job) -> None:
@@ -162,7 +162,7 @@ class RayLauncher(VisibleLauncher):
         return numbers
 
 
-def _check(survey: Survey, config: Config, root: str) -> None:
+def judge(survey: Survey, config: Config, root: str) -> None:
     """RunError or ConfigError for a cluster on which the run would not start, or not wholly."""
     head, nodes = survey.head, (survey.head, *survey.others)
     for node in nodes:

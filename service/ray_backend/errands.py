@@ -2,16 +2,17 @@
 
     python -m t6gps.service.ray_backend.errands NAME ARGUMENT...
 
-Each prints its result as the last line, in JSON; or one line `error: ...`, and ends with exit code 2.
+Each prints a line `result: ...` in JSON; or one line `error: ...`, and ends with exit code 2.
 """
 
 from __future__ import annotations
 
 import logging
+import secrets
 import shutil
 import sys
-import tempfile
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -23,6 +24,7 @@ from t6gps.service import checks, provenance
 from t6gps.service.checks import Wanted
 from t6gps.service.ray_backend import cluster, private, starting
 from t6gps.service.ray_backend.cluster import Reference
+from t6gps.service.ray_backend.jobs_api import RESULT
 from t6gps.service.steering import requests
 from t6gps.service.steering import status as statuses
 from t6gps.service.steering.status import Status
@@ -61,11 +63,26 @@ def look(root: str, file: str) -> Survey:
     folder = Path(root)
     checks.require([checks.root_folder], Wanted(0, folder))
     sees_file = Path(file).is_file()
-    folder.mkdir(parents=True, exist_ok=True)
-    options = {"job_config": private.without_working_folder()}
-    with private.adapted(), starting.started(options), tempfile.NamedTemporaryFile(dir=folder, prefix=".sign-") as sign:
-        head, *others = _nodes(sign.name)
+    joined = starting.started({"job_config": private.without_working_folder()})
+    sign = folder / f".sign-{secrets.token_hex(8)}"
+    with _there(folder, sign), private.adapted(), joined:
+        head, *others = _nodes(str(sign))
     return Survey(head=head, others=tuple(others), sees_file=sees_file)
+
+
+@contextmanager
+def _there(folder: Path, sign: Path) -> Iterator[None]:
+    """A file is there in a folder meanwhile; folders that were made for it go with it, unless somebody uses them."""
+    missing = [path for path in (folder, *folder.parents) if not path.exists()]
+    folder.mkdir(parents=True, exist_ok=True)
+    sign.touch()
+    try:
+        yield
+    finally:
+        sign.unlink()
+        with suppress(OSError):
+            for path in missing:
+                path.rmdir()
 
 
 def _nodes(sign: str) -> list[Node]:
@@ -148,7 +165,7 @@ def main(name: str, *arguments: str) -> None:
     """Run an errand and print what it brings."""
     logging.disable(logging.WARNING)
     try:
-        print(TypeAdapter(object).dump_json(ERRANDS[name](*arguments)).decode())
+        print(f"{RESULT}{TypeAdapter(object).dump_json(ERRANDS[name](*arguments)).decode()}")
     except T6GpsError as error:
         print(f"error: {' '.join(str(error).split())}")
         sys.exit(2)

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import shlex
 import threading
 import time
 from collections.abc import AsyncIterator, Callable, Iterator, Sequence
 from concurrent.futures import Future
-from importlib import util
+from importlib import import_module
 from pathlib import Path
 from typing import TypeVar
 from urllib import request
@@ -31,13 +32,16 @@ STOP_S = 45
 """How long a job that is asked to stop has before Ray kills it; Ray's own 3 s are short for a phase that ends."""
 UNKNOWN = "status code 404"
 """What Ray's client says of a job that the cluster does not know."""
+CHATTY = ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging")
+"""Loggers of Ray that tell of each upload."""
 REFUSED = (401, 403)
 TOKEN = "give its token (RAY_AUTH_MODE=token and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH)"
 REACH = "see that the cluster's head runs with its dashboard (ray[default]), and correct ray.address"
 INSTALL = "install this version of t6gps on the cluster's nodes, and set ray.bin to the folder of its programs"
 ENVIRONMENT: dict[str, object] = {"env_vars": {"RAY_JOB_STOP_WAIT_TIME_S": str(STOP_S)}}
 """Of every job, in Ray's words."""
-ERRANDS = "t6gps.service.ray_backend.errands"
+ERRANDS, RESULT = "t6gps.service.ray_backend.errands", "result: "
+"""The module of errands, and how the line begins that holds what one brings."""
 
 
 class JobsApi:
@@ -48,8 +52,12 @@ class JobsApi:
 
     def __init__(self, address: str) -> None:
         """Connect. ConfigError without Ray's client; RunError for a cluster with another version of Ray."""
-        if util.find_spec("aiohttp") is None:
-            raise ConfigError("--to ray needs aiohttp; install it with: pip install 't6gps[cluster]'")
+        try:
+            import_module("aiohttp")  # without it Ray has no such client
+        except ModuleNotFoundError as error:
+            raise ConfigError(f"--to ray needs {error.name}; install it with: pip install 't6gps[cluster]'") from None
+        for name in CHATTY:
+            logging.getLogger(name).setLevel(logging.WARNING)
         self.address = address
         private.read_authentication()
         found = _version(address)
@@ -88,7 +96,10 @@ class JobsApi:
                 yield text
 
     def errand(self, programs: str | None, name: str, *arguments: str, folder: Path | None = None) -> str:
-        """Run an errand on the cluster's head; the JSON that it brings. RunError where it fails, with its error."""
+        """Run an errand on the cluster's head; the JSON that it brings. RunError where it fails, with its error.
+
+        Its record stays: Ray takes the end of a job that is deleted for a fault of its own.
+        """
         job = self.submit(["python", "-P", "-m", ERRANDS, name, *arguments], programs, folder)
         deadline = time.monotonic() + ERRAND_S
         while (details := self.details(job)) is not None and not details.status.is_terminal():
@@ -98,12 +109,11 @@ class JobsApi:
             time.sleep(TICK_S)
         if details is None:
             raise RunError(f"{self.address}: the cluster has restarted just now; try again")
-        lines = [line for line in self.log(job).splitlines() if line.strip()]
-        last = lines[-1] if lines else details.message or ""
-        self._answer(lambda: self._client.delete_job(job))
-        if details.driver_exit_code == 0:
-            return last
-        raise RunError(f"on the cluster {self.address}: {_why(last)}")
+        lines = self.log(job).splitlines()
+        results = [line.removeprefix(RESULT) for line in lines if line.startswith(RESULT)]
+        if results:
+            return results[-1]
+        raise RunError(f"on the cluster {self.address}: {_why(last_words(lines) or details.message or 'no word')}")
 
     def _answer(self, ask: Callable[[], Answer]) -> Answer:
         """What the cluster answers, in a thread: Ray's client would wait for ever."""
@@ -156,8 +166,14 @@ def _version(address: str) -> str:
         raise RunError(f"no Jobs API of Ray answers at {address} ({reason}); {REACH}") from None
 
 
-def _why(last: str) -> str:
-    """What went wrong with an errand, by the last line of its log."""
-    if "No module named" in last or "not found" in last:
-        return f"{last.strip()}; {INSTALL}"
-    return last.strip().removeprefix("error: ")
+def last_words(lines: Sequence[str]) -> str:
+    """What a job said last: its error, else the last line that says something; empty where none does."""
+    said = [line.strip() for line in lines if line.strip()]
+    return next((line for line in reversed(said) if line.startswith("error: ")), said[-1] if said else "")
+
+
+def _why(words: str) -> str:
+    """What went wrong with an errand, by its last words."""
+    if "No module named" in words or "not found" in words:
+        return f"{words}; {INSTALL}"
+    return words.removeprefix("error: ")
