@@ -12,8 +12,9 @@ from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from functools import cached_property
 from pathlib import Path
+from typing import TypeVar
 
-from pydantic import TypeAdapter
+from pydantic import TypeAdapter, ValidationError
 
 from t6gps.service import config as configuration
 from t6gps.service import provenance
@@ -33,7 +34,11 @@ from t6gps.storage.errors import ConfigError, RunError
 
 SAME = ("t6gps", "schema")
 """What this machine and the cluster must have alike: it writes the configuration, and reads the tables."""
-STATUS = TypeAdapter(Status | None)
+Result = TypeVar("Result")
+SURVEY, REACHED = TypeAdapter(Survey), TypeAdapter(Status)
+STATUS: TypeAdapter[Status | None] = TypeAdapter(Status | None)
+PLACED, REMOVED = TypeAdapter(list[str]), TypeAdapter(None)
+"""What errands bring."""
 STATES = {
     "PENDING": JobState.PENDING,
     "RUNNING": JobState.RUNNING,
@@ -66,7 +71,7 @@ class RayLauncher(VisibleLauncher):
     def submit(self, folders: Sequence[Folder]) -> list[str]:
         config = configuration.load(str(folders[0].config))
         root, script = (str(path) for path in (self._there(folders[0]).root, folders[0].script))
-        survey = Survey.model_validate_json(self._errand("look", root, script))
+        survey = self._errand(SURVEY, "look", root, script)
         if self.target.root is None and not survey.sees_file:
             raise RunError(
                 f"{root} is not the same folder on the cluster {self.target.address}; give a --root that both see, or "
@@ -106,15 +111,12 @@ class RayLauncher(VisibleLauncher):
     def status(self, job: Job) -> Status | None:
         if self.target.root is None:
             return super().status(job)
-        return STATUS.validate_json(self._errand("status", self.target.root, job.run))
+        return self._errand(STATUS, "status", self.target.root, job.run)
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
         if self.target.root is None:
             return super().scale(job, workers, deadline_s)
-        said = self._errand("scale", self.target.root, job.run, str(workers), str(deadline_s))
-        reached = STATUS.validate_json(said)
-        assert reached is not None, "it was scaled"
-        return reached
+        return self._errand(REACHED, "scale", self.target.root, job.run, str(workers), str(deadline_s))
 
     def source(self, job: Job) -> Source:
         if self.target.root is None:
@@ -132,8 +134,12 @@ class RayLauncher(VisibleLauncher):
         there = self._there(folder)
         return ["bash", str(there.script), str(there.path)]
 
-    def _errand(self, name: str, *arguments: str, folder: Path | None = None) -> str:
-        return self.api.errand(self.target.bin, name, *arguments, folder=folder)
+    def _errand(self, result: TypeAdapter[Result], name: str, *arguments: str, folder: Path | None = None) -> Result:
+        said = self.api.errand(self.target.bin, name, *arguments, folder=folder)
+        try:
+            return result.validate_json(said)
+        except ValidationError:
+            raise RunError(f"{self.target.address} has another version of t6gps; {jobs_api.INSTALL}") from None
 
     def _place(self, config: Config, here: Sequence[Folder]) -> None:
         """Bring the jobs' folders into the cluster's root. RunError where that has a run of such a name."""
@@ -143,7 +149,7 @@ class RayLauncher(VisibleLauncher):
                 (Path(draft) / folder.run).mkdir()
                 folders.write(configuration.load(str(folder.config)), self._there(folder), Path(draft) / folder.run)
             runs = [folder.run for folder in here]
-            self._errand("place", str(self.target.root), "again" if again else "", *runs, folder=Path(draft))
+            self._errand(PLACED, "place", str(self.target.root), "again" if again else "", *runs, folder=Path(draft))
 
     def _started(self, here: Sequence[Folder]) -> list[str]:
         """Start the jobs; where one cannot be, the others are stopped."""
@@ -157,7 +163,7 @@ class RayLauncher(VisibleLauncher):
                     self.api.stop(number)
             if self.target.root is not None:
                 with suppress(RunError):
-                    self._errand("remove", self.target.root, *(folder.run for folder in here))
+                    self._errand(REMOVED, "remove", self.target.root, *(folder.run for folder in here))
             raise
         return numbers
 

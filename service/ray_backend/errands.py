@@ -163,7 +163,6 @@ ERRANDS: dict[str, Callable[..., object]] = {
 
 def main(name: str, *arguments: str) -> None:
     """Run an errand and print what it brings."""
-    logging.disable(logging.WARNING)
     try:
         print(f"{RESULT}{TypeAdapter(object).dump_json(ERRANDS[name](*arguments)).decode()}")
     except T6GpsError as error:
@@ -172,4 +171,5 @@ def main(name: str, *arguments: str) -> None:
 
 
 if __name__ == "__main__":
+    logging.disable(logging.WARNING)
     main(*sys.argv[1:])

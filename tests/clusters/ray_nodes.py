@@ -75,8 +75,10 @@ class Nodes(NodeProvider):
             self.tags[address] = tags | {TAG_RAY_NODE_STATUS: STATUS_UP_TO_DATE}
 
     def terminate_node(self, node_id: str) -> None:
-        os.killpg(self.processes.pop(node_id).pid, signal.SIGKILL)
+        process = self.processes.pop(node_id)
         del self.tags[node_id]
+        os.killpg(process.pid, signal.SIGKILL)
+        process.wait()
 
     @staticmethod
     def bootstrap_config(cluster_config: dict[str, Any]) -> dict[str, Any]:
