@@ -173,7 +173,10 @@ def judge(survey: Survey, config: Config, root: str) -> None:
     head, nodes = survey.head, (survey.head, *survey.others)
     for node in nodes:
         if node.fault:
-            raise RunError(f"node {node.address}: {node.fault}; {jobs_api.INSTALL}")
+            remedy = (
+                jobs_api.INSTALL if "No module named" in node.fault else "see ray status, and mend or remove the node"
+            )
+            raise RunError(f"node {node.address}: {node.fault}; {remedy}")
     here = provenance.build()
     _same(head, {name: here[name] for name in SAME}, "this machine")
     for node in survey.others:

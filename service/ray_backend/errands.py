@@ -86,15 +86,25 @@ def _there(folder: Path, sign: Path) -> Iterator[None]:
 
 
 def _nodes(sign: str) -> list[Node]:
-    """All nodes, that of this process first, each asked for itself."""
+    """All nodes, that of this process first, each asked for itself; without those that leave meanwhile."""
     here = cluster.this_node()
-    known: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
-    alive = sorted((node for node in known if node["Alive"]), key=lambda node: node["NodeID"] != here)
+    alive = sorted(_alive().values(), key=lambda node: node["NodeID"] != here)
     ask = ray.remote(num_cpus=0, max_retries=0)(_found)
     places = [NodeAffinitySchedulingStrategy(node["NodeID"], soft=False) for node in alive]
     answers = [ask.options(scheduling_strategy=place).remote(sign) for place in places]
     ready, _ = ray.wait(answers, num_returns=len(answers), timeout=NODES_DEADLINE_S)
-    return [_node(node, answer if answer in ready else None) for node, answer in zip(alive, answers, strict=True)]
+    nodes = {
+        node["NodeID"]: _node(node, answer if answer in ready else None)
+        for node, answer in zip(alive, answers, strict=True)
+    }
+    still = _alive()
+    return [node for name, node in nodes.items() if name in still or not node.fault]
+
+
+def _alive() -> dict[str, dict[str, Any]]:
+    """What Ray knows of the nodes that it takes for alive, by their names."""
+    known: list[dict[str, Any]] = ray.nodes()  # type: ignore[no-untyped-call]
+    return {node["NodeID"]: node for node in known if node["Alive"]}
 
 
 def _node(node: dict[str, Any], answer: Reference | None) -> Node:

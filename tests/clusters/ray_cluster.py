@@ -56,7 +56,10 @@ def missing() -> list[str]:
 
 @dataclass(frozen=True)
 class RayCluster:
-    """A cluster that is up: the folder of its files, its namespace and its token."""
+    """A cluster that is up: the folder of its files, its namespace and its token.
+
+    On each node FOLDER/split is a folder of the node's own.
+    """
 
     folder: Path
     namespace: str
@@ -93,6 +96,10 @@ class RayCluster:
     def nodes(self) -> list[str]:
         """Addresses of the nodes that the autoscaler has brought and that run."""
         return [file.stem for file in self.folder.glob("*.pid") if Path(f"/proc/{file.read_text()}").exists()]
+
+    def at_head(self, path: Path) -> Path:
+        """A path as the head sees it."""
+        return Path(f"/proc/{(self.folder / 'head').read_text()}/root{path}")
 
     def lose(self, node: str) -> None:
         """Kill a node."""
@@ -146,6 +153,7 @@ def _head(cluster: RayCluster, log: int) -> Iterator[subprocess.Popen[bytes]]:
     command = cluster.enter(*ray_start(cluster.folder, HEAD, *options))
     environment = cluster.environment | settings
     process = subprocess.Popen(command, env=environment, stdout=log, stderr=log, start_new_session=True)
+    (cluster.folder / "head").write_text(str(process.pid))
     try:
         yield process
     finally:

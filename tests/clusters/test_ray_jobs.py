@@ -22,6 +22,7 @@ from tiny_run import Trained
 
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
+from t6gps.service.steering.status import Status
 
 pytest.importorskip("aiohttp", reason="jobs on Ray need pip install 't6gps[cluster]'")
 pytestmark = [
@@ -72,13 +73,24 @@ def submit(run: str, *arguments: str, code: int = 0) -> str:
     return " ".join(done.stderr.split())
 
 
-def known(run: str) -> dict[str, object]:
+def known(run: str) -> Status:
     return json.loads(t6gps("status", run, "--json").stdout)
 
 
-def nodes_of(run: str) -> set[str]:
-    """Where workers of a run are at work."""
-    return {worker["node"] for worker in known(run).get("workers", ()) if worker["pid"]}
+def status_there(cluster: RayCluster, run: str) -> Status | None:
+    """How a run is by its file, which the head alone sees; None while there is none."""
+    file = cluster.at_head(cluster.folder / "split" / "runs" / run / "pool" / "status.json")
+    return json.loads(file.read_text()) if file.exists() else None
+
+
+def nodes_of(status: Status | None) -> set[str]:
+    """Where workers are at work."""
+    return {worker["node"] for worker in status["workers"] if worker["pid"]} if status else set()
+
+
+def replaced(status: Status, pids: set[int | None]) -> bool:
+    """True when two workers are at work, one of which is none of these processes."""
+    return len(nodes_of(status)) == 2 and not {worker["pid"] for worker in status["workers"]} <= pids
 
 
 def test_a_run_whose_root_the_head_alone_sees_gains_and_loses_nodes_and_loses_no_episode(
@@ -86,22 +98,21 @@ def test_a_run_whose_root_the_head_alone_sees_gains_and_loses_nodes_and_loses_no
 ) -> None:
     target(cluster, tmp_path, root=str(cluster.folder / "split" / "runs"))
     submit("far", *ENDLESS, "--autoscale", "1:2")
-    wait_until(lambda: len(nodes_of("far")) == 2, ENDS_S)
+    wait_until(lambda: len(nodes_of(status_there(cluster, "far"))) == 2, ENDS_S)
     (brought,) = cluster.nodes()
-    assert nodes_of("far") == {HEAD, brought}
+    assert nodes_of(known("far")) == {HEAD, brought}
 
     np.save(tmp_path / "hill.npy", np.linspace(0, 1, 81 * 81).reshape(81, 81))
     ground = f"--set=terrain.file={tmp_path / 'hill.npy'}"
     refused = submit("split", *tiny_run.settings(), ground, "--workers", "1", code=2)
     assert f"node {brought} does not see {cluster.folder}/split/runs" in refused
 
+    pids = {worker["pid"] for worker in status_there(cluster, "far")["workers"]}
     cluster.lose(brought)
-    wait_until(lambda: brought not in cluster.nodes(), 60.0)
-    wait_until(lambda: len(nodes_of("far")) == 2, ENDS_S)
+    wait_until(lambda: replaced(status_there(cluster, "far"), pids), ENDS_S)
     assert t6gps("scale", "far", "1").stdout.decode().startswith("run far has 1 workers")
-    before = known("far")["episodes"]["committed"]
-    wait_until(lambda: known("far")["episodes"]["committed"] > before, ENDS_S)
-    episodes = known("far")["episodes"]
+    episodes = status_there(cluster, "far")["episodes"]
+    assert episodes["committed"] > 0
     assert (episodes["quarantined"], episodes["duplicates"]) == (0, 0)
 
     assert "t6gps serve --root" in " ".join(t6gps("fetch", "far", "--to", tmp_path, code=2).stderr.split())
@@ -110,13 +121,13 @@ def test_a_run_whose_root_the_head_alone_sees_gains_and_loses_nodes_and_loses_no
     wait_until(lambda: not cluster.nodes(), 60.0)
     (tmp_path / "state" / "jobs" / "far.json").unlink()
     shutil.rmtree(tmp_path / "runs")
-    assert "far exists already on the cluster" in submit("far", *tiny_run.settings(), code=2)
+    assert "far exists already on the cluster" in submit("far", *tiny_run.settings(), "--workers", "1", code=2)
 
 
 def test_a_run_in_a_shared_root_has_the_bytes_of_one_process_and_comes_home(tiny: Trained, tmp_path: Path) -> None:
     submit("tiny", *tiny_run.settings(), "--workers", "1")
     assert "iteration 2" in t6gps("logs", "-f", "tiny").stdout.decode()
-    assert known("tiny")["job"]["state"] == "done"
+    assert json.loads(t6gps("status", "tiny", "--json").stdout)["job"]["state"] == "done"
     home = t6gps("fetch", "tiny", "--to", tmp_path / "home").stdout.decode().strip()
     assert run_digest.digests(Path(home)) == tiny.digests
 

@@ -113,6 +113,7 @@ def other(**changed: object) -> Node:
     ("survey", "settings", "words"),
     [
         ((other(fault="No module named 't6gps'"),), [], ["node 10.0.0.2", "No module named", "install this version"]),
+        ((other(fault="no answer within 60 s"),), [], ["node 10.0.0.2", "no answer", "mend or remove the node"]),
         (
             (other(build=BUILD | {"numpy": "1.0"}),), [],
             ["node 10.0.0.2", "numpy 1.0 (the head 10.0.0.1:", "install the same"],
