@@ -34,6 +34,8 @@ UNKNOWN = "status code 404"
 """What Ray's client says of a job that the cluster does not know."""
 CHATTY = ("ray.dashboard.modules.dashboard_sdk", "ray._private.runtime_env.packaging")
 """Loggers of Ray that tell of each upload."""
+OF_RAY = ("Running entrypoint for job", "Runtime env is setting up")
+"""Lines that Ray writes into the log of a job, perhaps after those of the job itself."""
 REFUSED = (401, 403)
 TOKEN = "give its token (RAY_AUTH_MODE=token and RAY_AUTH_TOKEN or RAY_AUTH_TOKEN_PATH)"
 REACH = "see that the cluster's head runs with its dashboard (ray[default]), and correct ray.address"
@@ -168,7 +170,7 @@ def _version(address: str) -> str:
 
 def last_words(lines: Sequence[str]) -> str:
     """What a job said last: its error, else the last line that says something; empty where none does."""
-    said = [line.strip() for line in lines if line.strip()]
+    said = [line.strip() for line in lines if line.strip() and not any(words in line for words in OF_RAY)]
     return next((line for line in reversed(said) if line.startswith("error: ")), said[-1] if said else "")
 
 

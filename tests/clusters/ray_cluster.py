@@ -80,8 +80,9 @@ class RayCluster:
         return ["nsenter", f"--net=/run/netns/{self.namespace}", *map(str, command)]
 
     def processes(self) -> list[int]:
+        """Processes inside the namespace, but for this one."""
         pids = subprocess.run(["ip", "netns", "pids", self.namespace], capture_output=True, text=True, check=True)
-        return [int(pid) for pid in pids.stdout.split()]
+        return [int(pid) for pid in pids.stdout.split() if int(pid) != os.getpid()]
 
     @contextmanager
     def inside(self) -> Iterator[None]:
@@ -168,7 +169,12 @@ def _enter_namespace(descriptor: int) -> None:
 
 
 def _end(cluster: RayCluster) -> None:
-    for pid in cluster.processes():
+    """Kill whatever is left inside."""
+    wait_until(lambda: not _killed(cluster.processes()), ENDED_S)
+
+
+def _killed(pids: list[int]) -> list[int]:
+    for pid in pids:
         with suppress(ProcessLookupError):
             os.kill(pid, signal.SIGKILL)
-    wait_until(lambda: not cluster.processes(), ENDED_S)
+    return pids

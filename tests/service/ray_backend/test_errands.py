@@ -64,5 +64,5 @@ def test_an_errand_says_its_result_or_its_error_in_one_line(root: Path, capsys: 
 
 def test_the_last_words_of_a_job_are_its_error() -> None:
     assert last_words(["iteration 1", "error: no room", "", "Job supervisor actor died"]) == "error: no room"
-    assert last_words(["iteration 1", " "]) == "iteration 1"
+    assert last_words(["iteration 1", " ", "Running entrypoint for job 1: bash train.sh"]) == "iteration 1"
     assert last_words([]) == ""
