@@ -1,6 +1,6 @@
 """SQL over the tables of a run, safe for questions from strangers.
 
-DuckDB runs in a child process (`sandbox`) that sees the four tables and nothing else: no files, no network,
+DuckDB runs in a child process (`sandbox`) that sees the tables and nothing else: no files, no network,
 no settings; one SELECT, bounded in length, nesting, memory, time and result.
 """
 
@@ -15,7 +15,7 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import BinaryIO
 
 import pyarrow as pa
@@ -53,7 +53,7 @@ class Head:
 
 
 def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
-    """The result of one SELECT over the tables frames, episodes, iterations and classes of `run`.
+    """The result of one SELECT over the tables of `run`.
 
     Only committed iterations are seen. Of two columns with one name, the second gets a number: cost, cost_1. Raises
     QueryError, with DuckDB's own sentence first where there is one, for SQL that is refused or wrong, and beyond 64 kB
@@ -83,8 +83,8 @@ def head(run: Run, sql: str, *, timeout_s: float = 30.0) -> Head:
 def _answer(run: Run, sql: str, form: str, timeout_s: float) -> Iterator[BinaryIO]:
     """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
     _check_size(sql)
-    iterations_n, files = tables.files(run)
-    question = {"sql": sql, "form": form, "iterations_n": iterations_n, "files": files, "timeout_s": timeout_s}
+    files = {table: asdict(found) for table, found in tables.files(run).items()}
+    question = {"sql": sql, "form": form, "files": files, "timeout_s": timeout_s}
     with tempfile.TemporaryFile() as result:
         try:
             child = subprocess.run(

@@ -19,7 +19,7 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from t6gps.storage import parquet
+from t6gps.storage.delta import parquet
 from t6gps.storage.errors import QueryError
 from t6gps.storage.sql import advice, formats
 
@@ -55,7 +55,7 @@ def _limit(timeout_s: float) -> None:
 def _relation(question: Mapping[str, Any]) -> duckdb.DuckDBPyRelation:
     connection = duckdb.connect(":memory:")
     for table, files in question["files"].items():
-        connection.register(table, parquet.rows(table, files, question["iterations_n"]))
+        connection.register(table, parquet.rows(table, parquet.Files(**files)))
     for setting in _SETTINGS:
         connection.execute(setting)
     _limit(question["timeout_s"])

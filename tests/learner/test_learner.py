@@ -14,7 +14,7 @@ from t6gps.learner.cost import running_cost
 from t6gps.learner.learner import Learner
 from t6gps.learner.rows import Rows
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError
 from t6gps.storage.records import PolicySnapshot
 
@@ -102,7 +102,7 @@ def test_the_report_fills_the_columns_of_its_tables(
     iterate(learner, tables)
     iteration, classes = learner.report()
     assert set(iteration) <= set(schema.ITERATIONS.names)
-    table = schema.check(pa.Table.from_pylist(classes, schema=schema.CLASSES), schema.CLASSES, "classes")
+    table = fields.check(pa.Table.from_pylist(classes, schema=schema.CLASSES), schema.CLASSES, "classes")
     actions = sum(table.num_rows - 1 for table in tables)
     assert sum(table.column("rows").to_pylist()) == actions
     assert sum(table.column("segments").to_pylist()) == iteration["segments"]

@@ -150,7 +150,7 @@ def test_libraries_compute_with_one_thread_while_it_is_asked_for(tmp_path: Path)
 def test_a_run_gives_what_is_stored(run: t6gps.Run) -> None:
     folder = catalog.open_run(run.path.parent, run.name)
     assert run == t6gps.open_run(run.path) == t6gps.runs(run.path.parent)[0]
-    assert run.episode(3).equals(tables.episode_frames(folder, 3))
+    assert run.episode(3).equals(tables.episode(folder, 3).frames)
     assert run.table("frames", ["step"]).equals(tables.read(folder, "frames", ["step"]))
     assert run.query("SELECT count(*) AS n FROM episodes").to_pylist() == [{"n": 12}]
     assert run.config.run.steps == 40
