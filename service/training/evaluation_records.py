@@ -49,7 +49,8 @@ class Occasion:
 def collecting(run: Run) -> Iterator[Spool]:
     """Where the episodes of an evaluation wait for each other. RunError where the run takes no files."""
     try:
-        with durable.draft(run.spool / "evaluation") as folder:
+        durable.sweep(run.path)
+        with durable.draft(run.path / "evaluation") as folder:
             yield Spool(folder, 0)
     except PermissionError as error:
         raise RunError(
