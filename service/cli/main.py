@@ -142,7 +142,7 @@ def evaluate(
     version: Annotated[
         int | None, typer.Option("--policy", min=0, help="Version of the policy; by default the newest.")
     ] = None,
-    keep: Annotated[bool, typer.Option("--keep/--no-keep", help="Keep the episodes in the run's tables.")] = True,
+    no_keep: Annotated[bool, typer.Option("--no-keep", help="Leave the run's tables as they are.")] = False,
     overrides: Overrides = None,
     workers: Workers = None,
     serial: Serial = False,
@@ -152,7 +152,7 @@ def evaluate(
     """Evaluate a run's policy without noise on unseen seeds, and keep the episodes."""
     run = catalog.open_run(root, run_name)
     config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
-    asked = session.Asked(episodes, seed, terrain_seed, version, keep)
+    asked = session.Asked(episodes, seed, terrain_seed, version, keep=not no_keep)
     with terminal.ProgressDisplay(config.run.iterations) as display:
         result, number = session.evaluate(run, config, asked, serial, engine, display)
     if as_json:
