@@ -63,7 +63,7 @@ def test_a_run_is_started_scaled_stopped_and_resumed_from_afar(
     assert catalog.process_of(run) is None
     assert client.evaluation("far") is not None
     assert tables.read(run, "episodes").num_rows == 40
-    assert client.versions("far") == [1]
+    assert client.versions("far") == [0, 1]
     assert client.figures("far") == ["ground_track.png", "learning.png", "segments.png"]
 
 
