@@ -13,6 +13,11 @@ import pyarrow.parquet as pq
 
 from t6gps.storage import durable, schema
 
+_VERIFIED = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
+"""Pages carry a CRC-32, which every reading checks; those of older files have none."""
+
 
 @dataclass(frozen=True)
 class Files:
@@ -35,6 +40,7 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
             definition,
             compression="zstd",
             compression_level=3,
+            write_page_checksum=True,
             use_dictionary=[field.name for field in definition if field not in floats],
             use_byte_stream_split=[
                 f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name for field in floats
@@ -50,7 +56,7 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
 
 def holds(file: Path, groups: Iterable[pa.Table]) -> bool:
     """True when the row groups of `file` are these tables."""
-    with pq.ParquetFile(file) as found:
+    with pq.ParquetFile(file, page_checksum_verification=True) as found:
         known = iter(range(found.num_row_groups))
         same = all((number := next(known, None)) is not None and found.read_row_group(number).equals(g) for g in groups)
         return same and next(known, None) is None
@@ -61,7 +67,7 @@ def rows(table: str, files: Files) -> ds.Dataset:
     definition = schema.TABLES[table]
     if not files.paths:
         return ds.dataset(definition.empty_table())
-    found = ds.dataset(files.paths, definition, format="parquet")
+    found = ds.dataset(files.paths, definition, format=_VERIFIED)
     if files.iterations_n is None:
         return found
     seen = pc.field("iteration") < files.iterations_n

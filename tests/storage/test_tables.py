@@ -315,3 +315,24 @@ def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: st
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="run trial is not whole"):
         query(run, "SELECT count(*) FROM frames")
+
+
+def test_a_byte_that_has_changed_in_a_page_is_damage_and_never_an_answer(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    file = run.tables / "frames" / "iteration-000000.parquet"
+    metadata = pq.read_metadata(file)
+    columns = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
+    whole = file.read_bytes()
+    for name in ("cost", "face", "nodes.list.element"):
+        column = next(column for column in columns if column.path_in_schema == name)
+        first = column.dictionary_page_offset if column.has_dictionary_page else column.data_page_offset
+        place = first + column.total_compressed_size - 3  # in its last page
+        changed = bytearray(whole)
+        changed[place] ^= 1
+        file.write_bytes(changed)
+        with pytest.raises(DataError, match=r"run trial is not whole: table frames .*restore"):
+            tables.read(run, "frames")
+        with pytest.raises(DataError, match="run trial is not whole"):
+            query(run, f"SELECT {name.split('.')[0]} FROM frames")
+    file.write_bytes(whole)
+    tables.read(run, "frames")
