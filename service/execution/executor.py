@@ -92,8 +92,8 @@ class Executor(ABC):
         """Start another learner in the place of one that died; it knows nothing."""
 
     @abstractmethod
-    def tend(self) -> None:
-        """Let the workers be looked after, where whoever calls is at other work for long."""
+    def tend(self, phase: str | None = None) -> None:
+        """Let the workers be looked after, where whoever calls is at other work for long: `phase`, for the status."""
 
     @abstractmethod
     def close(self, outcome: RunState = RunState.STOPPING) -> None:

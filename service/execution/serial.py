@@ -85,7 +85,7 @@ class SerialExecutor(Executor):
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)
 
-    def tend(self) -> None:
+    def tend(self, phase: str | None = None) -> None:
         """Nothing runs beside the caller here."""
 
     def close(self, outcome: RunState = RunState.STOPPING) -> None:

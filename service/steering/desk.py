@@ -42,7 +42,7 @@ class Desk(Outside):
     def told(self, situation: Situation, at_once: bool = False) -> None:
         if at_once or situation.now_s - self._published_s >= PUBLISH_S:
             self._published_s = situation.now_s
-            status.publish(self._run, status.describe(situation), self._request_id or None, self._most)
+            status.publish(self._run, status.describe(situation, self._request_id or None, self._most))
 
     def ended(self, situation: Situation) -> None:
         self._write(situation, (), ())

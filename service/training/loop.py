@@ -35,6 +35,8 @@ from t6gps.storage.spool import Spool, read
 
 LEARNER_DEATHS_ALLOWED_N = 3
 """In one iteration."""
+COMMIT = "commit"
+"""The phase in which an iteration is committed and its checkpoint is written."""
 
 
 class Observer(Protocol):
@@ -144,7 +146,7 @@ def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) 
 def _tended(executor: Executor, files: Sequence[Path]) -> Iterator[Episode]:
     """Episodes one after the other; the pool is tended meanwhile."""
     for file in files:
-        executor.tend()
+        executor.tend(COMMIT)
         yield read(file)
 
 
