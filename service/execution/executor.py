@@ -110,7 +110,12 @@ class Executor(ABC):
         """Keep what is needed to find out why the episode fails."""
         failures = self.ledger.failures[plan.episode_id]
         _log.warning(
-            "%s %d is quarantined after %d failures: %s", self._purpose, plan.episode_id, len(failures), failures[-1]
+            "%s %d is quarantined after %d failures: %s",
+            self._purpose,
+            plan.episode_id,
+            len(failures),
+            failures[-1],
+            extra={"episode": plan.episode_id},
         )
         if self.run is not None:
             snapshot = self._snapshots[plan.policy_version]

@@ -11,6 +11,7 @@ they have sampled is in the spool when the iteration's turn comes, which then re
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -37,6 +38,7 @@ LEARNER_DEATHS_ALLOWED_N = 3
 """In one iteration."""
 COMMIT = "commit"
 """The phase in which an iteration is committed and its checkpoint is written."""
+_log = logging.getLogger(__name__)
 
 
 class Observer(Protocol):
@@ -70,10 +72,11 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
                 _iterate(config, run, executor, observer, iteration)
                 deaths_n = 0
             return
-        except LearnerDiedError:
+        except LearnerDiedError as error:
             deaths_n += 1
             if deaths_n > LEARNER_DEATHS_ALLOWED_N:
                 raise
+            _log.warning("%s; another one resumes from the newest checkpoint", error)
             executor.replace_learner()
 
 
