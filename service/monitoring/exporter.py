@@ -32,15 +32,18 @@ Stamp = tuple[int, ...]
 
 
 class _Found(NamedTuple):
-    """A run, the process at work on it, and when one began with it last (ns)."""
+    """A run, the process at work on it, and when one began with it last."""
 
     run: Run
     pid: int | None
-    began_ns: int
+    began: Stamp
 
 
 class Exporter(Collector):
     """Tells how the runs of a root are, each time it is asked; one asks at a time.
+
+    What has not changed is not read again: a table between two commits, and the lock of a run that nobody works on,
+    which whoever takes it writes to.
 
     runs_most_n   runs that have metrics of their own
     """
@@ -48,6 +51,7 @@ class Exporter(Collector):
     def __init__(self, root: Path, runs_most_n: int = RUNS_MOST_N) -> None:
         self._root, self._most_n, self._asked = root, runs_most_n, Lock()
         self._progress: dict[Run, tuple[Stamp, Progress]] = {}
+        self._ended: dict[Run, Stamp] = {}
         self._registry = CollectorRegistry(auto_describe=False)
         self._registry.register(self)
         ProcessCollector(registry=self._registry)
@@ -61,7 +65,7 @@ class Exporter(Collector):
         """The metrics; `prometheus_client` asks for them."""
         found, unreadable_n = self._found()
         runs_n = len(found) + unreadable_n
-        shown = sorted(found, key=lambda each: (each.pid is None, -each.began_ns))[: self._most_n]
+        shown = sorted(found, key=lambda each: (each.pid is not None, each.began), reverse=True)[: self._most_n]
         samples: dict[Run, list[Sample]] = {}
         for each in shown:
             samples[each.run], whole = self._samples(each)
@@ -81,22 +85,25 @@ class Exporter(Collector):
     def _found(self) -> tuple[list[_Found], int]:
         """The runs of the root, and how many there are of which nothing can be said."""
         found: list[_Found] = []
-        unreadable_n = 0
-        for run in catalog.list_runs(self._root):
-            lock = run.path / ".lock"
+        runs, ended = catalog.list_runs(self._root), dict[Run, Stamp]()
+        for run in runs:
             try:
-                began_ns = lock.stat().st_mtime_ns if lock.exists() else 0
-                found.append(_Found(run, catalog.process_of(run), began_ns))
+                stamp = _stamp(run.path / ".lock")
+                pid = None if self._ended.get(run) == stamp else catalog.process_of(run)
             except (T6GpsError, OSError):
-                unreadable_n += 1
-        return found, unreadable_n
+                continue
+            if pid is None:
+                ended[run] = stamp
+            found.append(_Found(run, pid, stamp))
+        self._ended = ended
+        return found, len(runs) - len(found)
 
     def _samples(self, found: _Found) -> tuple[list[Sample], bool]:
         """What can be said of a run, and whether that is everything."""
         samples: list[Sample] = []
         parts: tuple[Callable[[], Iterable[Sample]], ...] = (
             lambda: run_metrics.of_process(found.run, found.pid),
-            lambda: run_metrics.of_folder(found.run),
+            lambda: run_metrics.of_folder(found.run, found.pid is not None),
             lambda: run_metrics.of_progress(self._known(found.run)),
         )
         whole = True
@@ -109,20 +116,20 @@ class Exporter(Collector):
 
     def _known(self, run: Run) -> Progress:
         """How far a run is; its tables are read when an iteration was committed since."""
-        stamp = _stamp(run)
+        stamp = _stamp(run.tables / "episodes" / "_delta_log")  # of the table that is committed last
         known = self._progress.get(run)
         if known is None or known[0] != stamp:
             known = self._progress[run] = stamp, run_metrics.progress(run)
         return known[1]
 
 
-def _stamp(run: Run) -> Stamp:
-    """Changes whenever an iteration is committed."""
+def _stamp(path: Path) -> Stamp:
+    """When a file or folder was changed last, and which it is; nothing where it is not there."""
     try:
-        log = (run.tables / "episodes" / "_delta_log").stat()  # of the table that is committed last
+        found = path.stat()
     except FileNotFoundError:
         return ()
-    return log.st_ino, log.st_mtime_ns
+    return found.st_mtime_ns, found.st_ino
 
 
 def _families(of_root: Iterable[Sample], of_runs: Mapping[Run, Iterable[Sample]]) -> Iterator[Family]:

@@ -59,7 +59,7 @@ RUN_STATE = Metric(
 RUN_PHASE = Metric(
     "t6gps_run_phase",
     _GAUGE,
-    "1 for what it does at present, 0 for others and without a process",
+    "1 for what it does at present, 0 for others",
     True,
     "phase",
     RUN_PHASES,
@@ -101,12 +101,14 @@ DROPPED = Metric("t6gps_episodes_dropped_total", _COUNTER, "episodes that came t
 QUARANTINED = Metric("t6gps_episodes_quarantined", _GAUGE, "episodes in quarantine: crash bundles that are kept")
 BACKLOG = Metric("t6gps_episodes_backlog", _GAUGE, "episodes of the batch that are neither durable nor in quarantine")
 IN_FLIGHT = Metric("t6gps_in_flight_bytes", _GAUGE, "size of the episodes under way")
-SPOOL = Metric("t6gps_spool_bytes", _GAUGE, "size of the durable episodes whose iteration is not committed")
+SPOOL = Metric("t6gps_spool_bytes", _GAUGE, "size of durable episodes whose iteration is not committed")
 
 ITERATIONS = Metric("t6gps_iterations_total", _COUNTER, "iterations that are committed")
 ITERATIONS_PLANNED = Metric("t6gps_iterations_planned", _GAUGE, "iterations that it shall have")
 CONTROL_STEPS = Metric("t6gps_control_steps_total", _COUNTER, "control steps of committed iterations")
-STEP_RATE = Metric("t6gps_control_steps_per_second", _GAUGE, "control steps sampled per second, of the last iteration")
+STEP_RATE = Metric(
+    "t6gps_control_steps_per_second", _GAUGE, "control steps per second of the last iteration, learning included"
+)
 COST = Metric(
     "t6gps_cost_square_meters_per_square_second", _GAUGE, "mean running cost of the last iteration's episodes"
 )

@@ -76,13 +76,14 @@ def _one_of(metric: Metric, value: str) -> Iterator[Sample]:
     return (Sample(metric, each == value, each) for each in metric.values)
 
 
-def of_folder(run: Run) -> Iterator[Sample]:
-    """What lies in the run's folder beside its tables."""
-    size_n = 0
-    for file in run.spool.iterdir():
-        with suppress(FileNotFoundError):  # its iteration was committed just now
-            size_n += file.stat().st_size
-    yield Sample(metrics.SPOOL, size_n)
+def of_folder(run: Run, at_work: bool) -> Iterator[Sample]:
+    """What lies in the run's folder beside its tables; its spool while a process is `at_work`."""
+    if at_work:
+        size_n = 0
+        for file in run.spool.iterdir():
+            with suppress(FileNotFoundError):  # its iteration was committed just now
+                size_n += file.stat().st_size
+        yield Sample(metrics.SPOOL, size_n)
     yield Sample(metrics.QUARANTINED, sum(1 for _ in run.bundles.glob("[!.]*.json")))
 
 

@@ -160,6 +160,16 @@ def test_a_process_that_ended_without_a_word_leaves_its_last_state_and_no_presen
     assert not {"t6gps_workers", "t6gps_run_phase", "t6gps_episodes_backlog"} & {name for name, *_ in found}
 
 
+def test_a_run_that_begins_or_ends_between_two_scrapes_is_seen(root: Path) -> None:
+    run, exporter = catalog.open_run(root, "walk"), Exporter(root)
+    found = []
+    for _ in range(2):
+        found.append(numbers(exporter.text())["t6gps_run_up", "walk"])
+        with catalog.locked(run):
+            found.append(numbers(exporter.text())["t6gps_run_up", "walk"])
+    assert found == [0, 1, 0, 1]
+
+
 def test_what_an_earlier_process_said_is_not_taken_for_the_present_ones(root: Path) -> None:
     run = catalog.open_run(root, "walk")
     tell(run, troubled())
@@ -182,7 +192,7 @@ def test_what_an_earlier_process_said_is_not_taken_for_the_present_ones(root: Pa
         ("config.json", b"\xff"),
         ("tables/episodes/_delta_log/00000000000000000000.json", b"{"),
         ("tables/iterations/iteration-000000.parquet", b"PAR1"),
-        ("spool", None),
+        ("tables/iterations/iteration-000000.parquet", None),
     ],
 )
 def test_a_damaged_run_is_counted_and_hides_no_other_and_nothing_else_of_itself(
@@ -192,8 +202,7 @@ def test_a_damaged_run_is_counted_and_hides_no_other_and_nothing_else_of_itself(
     run = catalog.open_run(root, "walk")
     run.pool.mkdir()
     if content is None:
-        (run.spool / "episode").unlink()
-        (run.path / file).rmdir()
+        (run.path / file).unlink()
     else:
         (run.path / file).write_bytes(content)
     found = numbers(Exporter(root).text())
