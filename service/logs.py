@@ -114,6 +114,15 @@ def as_json() -> bool:
     return _process.format is Format.JSON
 
 
+def said(line: str) -> str:
+    """What a line of a log says: the message of an object, any other line as it is."""
+    try:
+        known = json.loads(line)
+    except ValueError:
+        return line
+    return str(known["message"]) if isinstance(known, dict) and "message" in known else line
+
+
 def adopt(library: str) -> None:
     """Let a library's logger speak as this package does, where lines are objects."""
     if as_json():

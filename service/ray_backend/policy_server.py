@@ -136,7 +136,7 @@ class PolicyServer:
 
     def _replace(self, why: str) -> None:
         log = "" if self.process is None else processes.log_tail(self._logs, self.process.pid)
-        last_words = log.strip().rpartition("\n")[2]
+        last_words = logs.said(log.strip().rpartition("\n")[2])
         self._deaths.add(f"it {why}" + (f" ({last_words})" if last_words else ""))
         _log.warning("the policy server %s; another one takes its place", why)
         ray.kill(self.source.actor)

@@ -17,6 +17,8 @@ from command import t6gps
 from tiny_run import settings
 
 from t6gps.service import logs
+from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.job import last_words
 from t6gps.service.logs import Format, Role, Speaker
 
 JSON = Speaker(Format.JSON, Role.WORKER, "walk", slot=3)
@@ -94,6 +96,18 @@ def test_who_works_for_somebody_is_of_the_same_run_and_format() -> None:
     logs.begin(Speaker(Format.JSON, Role.SUPERVISOR, "walk", episode=3))
     assert logs.other(Role.WORKER, slot=2) == Speaker(Format.JSON, Role.WORKER, "walk", 2)
     assert logs.other(Role.SUPERVISOR, "run").run == "run"
+
+
+def test_the_last_words_of_a_job_are_its_message_in_either_format(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    logs.begin(JSON)
+    log.error("the disk is full")
+    folder = Folder(tmp_path)
+    for text in (capsys.readouterr().err, "the disk is full\n", '"the disk"\nthe disk is full\n\n'):
+        folder.log.write_text("before\n" + text)
+        assert last_words(folder) == "the disk is full"
+    assert [logs.said(line) for line in ("3", '{"a": 1}', "{", "")] == ["3", '{"a": 1}', "{", ""]
 
 
 def test_another_format_is_one_error(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
