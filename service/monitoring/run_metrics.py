@@ -80,7 +80,7 @@ def of_folder(run: Run, at_work: bool) -> Iterator[Sample]:
     """What lies in the run's folder beside its tables; its spool while a process is `at_work`."""
     if at_work:
         size_n = 0
-        for file in run.spool.iterdir():
+        for file in run.spool.glob("*/[!.]*"):
             with suppress(FileNotFoundError):  # its iteration was committed just now
                 size_n += file.stat().st_size
         yield Sample(metrics.SPOOL, size_n)

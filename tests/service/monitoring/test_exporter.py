@@ -21,6 +21,7 @@ from t6gps.service.steering import status
 from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import Episode
+from t6gps.storage.spool import Spool
 
 Numbers = dict[tuple[str, ...], float]
 ROW = {"steps": 600, "cost": 1.5, "forward_speed_m_per_s": 0.25, "stuck_share_by_distance": 0.125, "sampling_s": 2.0}
@@ -62,7 +63,7 @@ def root(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
     run = create(tmp_path / "runs", "walk")
     row = dict.fromkeys(schema.ITERATIONS.names, 0) | ROW
     tables.commit_iteration(run, 0, iter([make_episode(0, 0)]), row, [])
-    (run.spool / "episode").write_bytes(b"1234")
+    Spool(run.spool, 1).append(make_episode(1, 1))
     run.bundles.mkdir()
     (run.bundles / "episode-5.json").write_text("{}")
     return run.path.parent
@@ -86,7 +87,7 @@ def test_a_run_at_work_has_every_metric_and_its_numbers_are_those_of_pool_and_ta
         ("t6gps_episodes_total", "walk"): ledger["committed"],
         ("t6gps_episode_failures_total", "walk", "error"): ledger["failures"],
         ("t6gps_episodes_quarantined", "walk"): 1,
-        ("t6gps_spool_bytes", "walk"): 4,
+        ("t6gps_spool_bytes", "walk"): Spool(run.spool, 1).path(1).stat().st_size,
         ("t6gps_iterations_total", "walk"): 1,
         ("t6gps_control_steps_total", "walk"): 600,
         ("t6gps_control_steps_per_second", "walk"): 200,
