@@ -58,6 +58,14 @@ fuzz: install
 soak: install
 	T6GPS_SOAK_MINUTES=30 $(BIN)/pytest -s tests/faults/test_workers.py tests/faults/test_soak.py -k 't1_ or t13 or t14'
 
+# The image: built with buildah, then one iteration trained in it. IMAGE_ARGS goes to `buildah build`.
+BASE ?= docker.io/library/python:3.11-slim-bookworm
+IMAGE ?= t6gps
+.PHONY: image
+image:
+	buildah build --build-arg BASE=$(BASE) $(IMAGE_ARGS) --file deploy/Dockerfile --tag $(IMAGE) .
+	bash tests/clusters/image.sh $(IMAGE)
+
 # Tables of measured figures in README.md and docs, from docs/figures.
 .PHONY: docs
 docs: install

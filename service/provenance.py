@@ -47,16 +47,18 @@ def provenance() -> Provenance:
     return Provenance(commit(), now, platform.platform(), os.cpu_count() or 1, versions())
 
 
-def commit() -> str:
-    """The checked-out commit, or the version of an installed package."""
-    folder = Path(__file__).parent
-    git = subprocess.run(
-        ["git", "-C", str(folder), "describe", "--always", "--dirty", "--exclude", "*"],
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    return git.stdout.strip() if git.returncode == 0 else metadata.version("t6gps")
+def commit(module: Path = Path(__file__)) -> str:
+    """The checked-out commit that a module of ours is tracked in.
+
+    The version of the package where it is installed: without git, or inside of somebody else's repository.
+    """
+    git = ["git", "-C", str(module.parent)]
+    try:
+        subprocess.run([*git, "ls-files", "--error-unmatch", module.name], capture_output=True, check=True)
+        described = [*git, "describe", "--always", "--dirty", "--exclude", "*"]
+        return subprocess.run(described, capture_output=True, text=True, check=True).stdout.strip()
+    except (FileNotFoundError, subprocess.CalledProcessError):
+        return metadata.version("t6gps")
 
 
 def versions() -> dict[str, str]:

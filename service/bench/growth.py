@@ -81,6 +81,7 @@ def growth(episodes: Sequence[Episode], say: Say, factors: Sequence[int] = FACTO
 
     iteration_4x_steps         control steps of an iteration with four copies
     iteration_4x_*_s           seconds of its phases, as in the table `iterations`; `commit_s` for commit and checkpoint
+    iteration_4x_disk_mb       what an iteration leaves behind in the run's folder
     iteration_4x_*_peak_mb     largest resident memory of supervisor, learner, and a process that fits models
     """
     figures: dict[str, float] = {}
@@ -127,7 +128,7 @@ def _iterate(folder: Path, episodes_n: int) -> dict[str, float]:
         closing(RayExecutor(config, run, partial(ReplayingWorker, folder=folder))) as executor,
     ):
         loop.train(config, run, executor, clock)
-        peaks = {role: _peak_mb(begin) for role, begin in ROLES.items()}
+        peaks = {role: peak_mb(begin) for role, begin in ROLES.items()}
         peaks["supervisor"] = processes.peak_mb(os.getpid())
         executor.close(RunState.DONE)
     row, took_s = clock.rows[-1], clock.ends_s[-1] - clock.ends_s[-2]
@@ -136,11 +137,12 @@ def _iterate(folder: Path, episodes_n: int) -> dict[str, float]:
         "steps": row["steps"],
         **phases,
         "commit_s": took_s - sum(phases.values()),
+        "disk_mb": sum(path.stat().st_size for path in run.path.rglob("*") if path.is_file()) / ITERATIONS_N / 1e6,
         **{f"{role}_peak_mb": peak for role, peak in peaks.items()},
     }
 
 
-def _peak_mb(begin: tuple[str, ...]) -> float:
+def peak_mb(begin: tuple[str, ...]) -> float:
     """The largest peak of the processes below this one whose command lines begin so; 0 when there is none."""
     below = processes.descendants(os.getpid())
     return max((processes.peak_mb(pid) for pid in below if processes.command(pid).startswith(begin)), default=0.0)

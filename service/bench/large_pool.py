@@ -12,7 +12,6 @@ import os
 import socket
 import tempfile
 import time
-from collections.abc import Callable
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
@@ -23,7 +22,7 @@ import ray
 
 from t6gps.service import seeding
 from t6gps.service.bench.contenders import Enough, Job
-from t6gps.service.bench.role_clock import RoleClock
+from t6gps.service.bench.role_clock import RoleClock, ThreadClock
 from t6gps.service.bench.tally import Tally, steps_of
 from t6gps.service.config import Config
 from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
@@ -31,6 +30,7 @@ from t6gps.service.pool.ledger import Ledger
 from t6gps.service.pool.outside import Nobody
 from t6gps.service.pool.pool import Pool
 from t6gps.service.pool.state import Identity, PoolState, RunState, WorkerId
+from t6gps.service.pool.transport import Report
 from t6gps.service.ray_backend.cluster import connection, this_node
 from t6gps.service.ray_backend.transport import Call, RayTransport, Remote
 from t6gps.service.ray_backend.worker_actor import Answer, Started
@@ -77,20 +77,29 @@ def _renumbered(table: pa.Table, plan: EpisodePlan) -> pa.Table:
 
 
 class SlotsTransport(RayTransport):
-    """Workers as slots of a few actors."""
+    """Workers as slots of a few actors.
+
+    calls   counts what plans and results take of the supervisor's thread
+    """
 
     def __init__(self, job: Job, slots_n: int) -> None:
         super().__init__(_no_worker, job.config.rollout, CPUS_PER_PROCESS, TIMINGS)
         plain: Any = SlotsActor
         made = ray.remote(num_cpus=CPUS_PER_PROCESS, max_restarts=0)(plain).options(max_concurrency=4 * slots_n)
         self._actors = [made.remote(job) for _ in range(PROCESSES_N)]
+        self.calls = ThreadClock()
 
     def start(self, worker: WorkerId) -> None:
         actor = self._actors[worker.slot % PROCESSES_N]
         self._begin(worker, Remote(actor), actor.open.remote(worker.slot))
 
     def send(self, worker: WorkerId, plan: EpisodePlan) -> None:
-        self._await(Call(worker, self._remotes[worker].actor.run.remote(worker.slot, plan), plan))
+        with self.calls:
+            self._await(Call(worker, self._remotes[worker].actor.run.remote(worker.slot, plan), plan))
+
+    def poll(self, wait_s: float) -> list[Report]:
+        with self.calls:
+            return super().poll(wait_s)
 
     def close(self) -> None:
         """End the actors."""
@@ -103,27 +112,23 @@ def _no_worker(_: object) -> Any:
 
 
 class _TimedLedger(Ledger):
-    """Counts the seconds spent in it per episode's way: lease, arrive, commit."""
+    """Counts what is spent in it per episode's way: lease, arrive, commit."""
 
     def __init__(self) -> None:
         super().__init__()
-        self.spent_s = 0.0
-
-    def _timed(self, call: Callable[[], Any]) -> Any:
-        begin_s = time.thread_time()
-        try:
-            return call()
-        finally:
-            self.spent_s += time.thread_time() - begin_s
+        self.clock = ThreadClock()
 
     def lease(self, slot: int, incarnation: int) -> EpisodePlan | None:
-        return self._timed(lambda: super(_TimedLedger, self).lease(slot, incarnation))
+        with self.clock:
+            return super().lease(slot, incarnation)
 
     def arrive(self, plan: EpisodePlan) -> bool:
-        return self._timed(lambda: super(_TimedLedger, self).arrive(plan))
+        with self.clock:
+            return super().arrive(plan)
 
     def commit(self, episode_id: int) -> None:
-        self._timed(lambda: super(_TimedLedger, self).commit(episode_id))
+        with self.clock:
+            super().commit(episode_id)
 
 
 def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, float]:
@@ -132,6 +137,7 @@ def large_pool(job: Job, sizes: tuple[int, ...], seconds: float) -> dict[str, fl
     asked_episodes_per_s, episodes_per_s     n / EPISODE_S, and what was committed
     supervisor_ms, ledger_ms, committer_ms   processor time of the main thread per committed episode; the supervisor's
                                              has Ray's calls from it
+    calls_ms                                 of the supervisor's, Ray's calls and what they give back
     background_ms                            processor time of Ray's threads in the same process
     commit_wait_ms                           what the main thread waits while it commits an episode: for the disk, and
                                              for a core where the machine has other work
@@ -165,7 +171,8 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
                 raise Enough
             if len(tally.done) == 1:  # from here on it is counted
                 clock.start()
-                ledger.spent_s, wait_s, main_s = 0.0, 0.0, time.thread_time()
+                ledger.clock.spent_s, transport.calls.spent_s = 0.0, 0.0
+                wait_s, main_s = 0.0, time.thread_time()
 
         with suppress(Enough):
             pool.sample(keep)
@@ -178,8 +185,9 @@ def _measured(job: Job, workers_n: int, seconds: float) -> dict[str, float]:
     return {
         "asked_episodes_per_s": workers_n / EPISODE_S,
         "episodes_per_s": episodes_n / took_s,
-        "supervisor_ms": 1e3 * (main_s - ledger.spent_s - spent_s["committer"]) / episodes_n,
-        "ledger_ms": 1e3 * ledger.spent_s / episodes_n,
+        "supervisor_ms": 1e3 * (main_s - ledger.clock.spent_s - spent_s["committer"]) / episodes_n,
+        "calls_ms": 1e3 * transport.calls.spent_s / episodes_n,
+        "ledger_ms": 1e3 * ledger.clock.spent_s / episodes_n,
         "committer_ms": 1e3 * spent_s["committer"] / episodes_n,
         "background_ms": 1e3 * (own_s - main_s) / episodes_n,
         "commit_wait_ms": 1e3 * wait_s / episodes_n,

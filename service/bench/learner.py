@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
-from contextlib import closing
+from collections.abc import Iterator, Sequence
+from contextlib import closing, contextmanager
 
 from t6gps.learner.bench import speed
 from t6gps.learner.phases import PHASES
@@ -16,6 +16,7 @@ from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.execution.wiring import new_learner
+from t6gps.storage import ipc
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 
 UNTRAINED_EPISODES = 60
@@ -30,14 +31,16 @@ def learner(say: Say) -> dict[str, float]:
     The robot is simulated for it, which takes one to two minutes on two cores and is not part of any figure.
     """
     config = configuration.load("rough", ["run.episodes=300"])
-    episodes = _rolling(config, say)
+    with rolling(config, say) as sampled:
+        episodes = sampled
     say(f"speed: {len(episodes)} episodes")
     figures = speed.measure(lambda: new_learner(config), [episode.frames for episode in episodes], config.learner)
     return figures | growth.growth(episodes, say)
 
 
-def _rolling(config: Config, say: Say) -> list[Episode]:
-    """300 episodes on rough ground of a robot that rolls, as in all but the first iteration.
+@contextmanager
+def rolling(config: Config, say: Say) -> Iterator[list[Episode]]:
+    """An iteration's episodes of a robot that rolls, as in all but the first; their workers are there until the end.
 
     They follow 60 episodes of the untrained policy and one iteration of learning from them.
     """
@@ -50,11 +53,15 @@ def _rolling(config: Config, say: Say) -> list[Episode]:
         for phase in PHASES:
             for _ in getattr(taught, phase.name)():
                 pass
-        return _sampled(executor, trained, taught.policy())
+        yield _sampled(executor, trained, taught.policy())
 
 
 def _sampled(executor: Executor, plans: Sequence[EpisodePlan], policy: PolicySnapshot) -> list[Episode]:
-    """Episodes in the order of their plans."""
+    """Episodes in the order of their plans; copies, since the object store's memory goes with its Ray."""
     sampled: list[Episode] = []
-    executor.sample(plans, policy, sampled.append)
+
+    def keep(episode: Episode) -> None:
+        sampled.append(Episode(*ipc.unpack(ipc.pack(episode.frames, episode.summary), 2)))
+
+    executor.sample(plans, policy, keep)
     return sorted(sampled, key=lambda episode: episode.episode_id)

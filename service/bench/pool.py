@@ -57,14 +57,14 @@ def pool(say: Say, seconds: float = SECONDS, rounds: int = ROUNDS) -> dict[str, 
     """
     if seconds <= 0 or rounds < 1:
         raise ConfigError(f"bench pool needs seconds > 0 and rounds >= 1, found {seconds:g} and {rounds}")
-    check_local()
+    check_local("pool")
     return measure(Sizes.within(seconds, rounds), say)
 
 
-def check_local() -> None:
+def check_local(bench: str) -> None:
     """ConfigError when RAY_ADDRESS names a cluster."""
     if checks.cluster_address() is not None:
-        raise ConfigError("bench pool measures this machine, found RAY_ADDRESS set; unset it")
+        raise ConfigError(f"bench {bench} measures this machine, found RAY_ADDRESS set; unset it")
 
 
 def measure(sizes: Sizes, say: Say) -> dict[str, float | None]:

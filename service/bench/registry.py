@@ -17,6 +17,7 @@ BENCHMARKS = {
     "learner": "t6gps.service.bench.learner",
     "physics": "t6gps.workers.bench.physics",
     "pool": "t6gps.service.bench.pool",
+    "scale": "t6gps.service.bench.scale",
     "soundness": "t6gps.workers.bench.soundness",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
@@ -24,7 +25,7 @@ BENCHMARKS = {
 
 SIZED = ("pool",)
 """Benchmarks that can be told how long and how often to measure."""
-LONG = ("learner", "pool")
+LONG = ("learner", "pool", "scale")
 """Benchmarks that say how far they are."""
 
 

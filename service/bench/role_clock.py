@@ -18,6 +18,30 @@ TITLES = {
 ROLES = ("worker", "supervisor", "committer", "learner", "policy_server", "ray")
 
 
+class ThreadClock:
+    """Counts processor seconds of this thread inside of `with`; `start` begins without an end.
+
+    spent_s   until the last end
+    """
+
+    def __init__(self) -> None:
+        self.spent_s, self._begin_s = 0.0, 0.0
+
+    def start(self) -> None:
+        """Count from now on."""
+        self._begin_s = time.thread_time()
+
+    def so_far_s(self) -> float:
+        """What is counted until now, where it has begun and not ended."""
+        return self.spent_s + time.thread_time() - self._begin_s
+
+    def __enter__(self) -> None:
+        self.start()
+
+    def __exit__(self, *_: object) -> None:
+        self.spent_s = self.so_far_s()
+
+
 class RoleClock:
     """Counts processor seconds from `start` on. What this process spends outside of `of` is the supervisor's."""
 

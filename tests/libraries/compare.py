@@ -23,7 +23,7 @@ WORKERS_N = 2
 
 def measure(seconds: float, rounds_n: int, say: Say) -> dict[str, float]:
     """The figures by name, from turns of such length and number."""
-    pool.check_local()
+    pool.check_local("pool")
     job = rough_job(WORKERS_N, seconds)
     contenders = [
         Contender("raw_2", job, raw),

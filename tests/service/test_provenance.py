@@ -3,10 +3,14 @@
 from __future__ import annotations
 
 import platform
+import subprocess
 from datetime import UTC, datetime, timedelta
 from importlib import metadata
+from pathlib import Path
 
-from t6gps.service.provenance import COMPILED, build, differences, provenance, versions
+import pytest
+
+from t6gps.service.provenance import COMPILED, build, commit, differences, provenance, versions
 from t6gps.storage.schema import SCHEMA_VERSION
 
 
@@ -35,3 +39,19 @@ def test_differences_name_what_is_missing_on_either_side() -> None:
     assert differences({"a": "1", "b": "2"}, {"b": "3", "c": "4"}) == (
         "b 2 (the run: 3), c none (the run: 4), a 1 (the run: none)"
     )
+
+
+def test_without_git_the_version_stands_for_the_commit(monkeypatch: pytest.MonkeyPatch, tmp_path: Path) -> None:
+    monkeypatch.setenv("PATH", str(tmp_path))
+    assert commit() == metadata.version("t6gps")
+
+
+def test_the_commit_of_another_repository_around_the_installation_is_not_ours(tmp_path: Path) -> None:
+    module = tmp_path / "installed.py"
+    module.touch()
+    git = ["git", "-C", str(tmp_path), "-c", "user.name=a", "-c", "user.email=a@b"]
+    subprocess.run([*git, "init", "--quiet"], check=True)
+    subprocess.run([*git, "commit", "--quiet", "--allow-empty", "--message=theirs"], check=True)
+    assert commit(module) == metadata.version("t6gps")
+    subprocess.run([*git, "add", module.name], check=True)
+    assert commit(module) != metadata.version("t6gps")
