@@ -4,15 +4,18 @@ from __future__ import annotations
 
 from t6gps.service.launch import target as targets
 from t6gps.service.launch.job import Job
+from t6gps.service.launch.kubernetes.launcher import KubernetesLauncher
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.local import LocalLauncher
 from t6gps.service.launch.slurm import SlurmLauncher
-from t6gps.service.launch.target import Slurm, Target
+from t6gps.service.launch.target import K8s, Slurm, Target
 
 
 def of(target: Target) -> Launcher:
     """The launcher of a target."""
-    return SlurmLauncher(target) if isinstance(target, Slurm) else LocalLauncher()
+    if isinstance(target, Slurm):
+        return SlurmLauncher(target)
+    return KubernetesLauncher(target) if isinstance(target, K8s) else LocalLauncher()
 
 
 def serving(job: Job) -> Launcher:

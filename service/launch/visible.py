@@ -5,11 +5,12 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from t6gps.service.config import Config
 from t6gps.service.launch.fetch import FolderSource, Source
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.steering import requests
 from t6gps.service.steering import status as statuses
@@ -28,10 +29,10 @@ class VisibleLauncher(ABC):
     def check(self, config: Config) -> None: ...
 
     @abstractmethod
-    def render(self, folders: Sequence[Folder]) -> str: ...
+    def render(self, planned: Sequence[Planned]) -> str: ...
 
     @abstractmethod
-    def submit(self, folders: Sequence[Folder]) -> list[str]: ...
+    def submit(self, planned: Sequence[Planned]) -> list[str]: ...
 
     @abstractmethod
     def state(self, job: Job) -> tuple[JobState, str]: ...
@@ -67,8 +68,8 @@ class VisibleLauncher(ABC):
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
         return requests.scale(_run(job), workers, deadline_s)
 
-    def source(self, job: Job) -> Source:
-        return FolderSource(_run(job))
+    def source(self, job: Job) -> AbstractContextManager[Source]:
+        return nullcontext(FolderSource(_run(job)))
 
 
 def _run(job: Job) -> Run:
