@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import re
 import subprocess
 from collections.abc import Iterator
 from dataclasses import dataclass
@@ -16,21 +17,29 @@ from t6gps.storage.errors import RunError
 ANSWER_S, REQUEST_S = 120.0, 20
 """How long kubectl may take, and how long it waits for the cluster to answer once."""
 PIECE_BYTES = 1 << 20
+UNREACHED = "see that the cluster is up and reached from here, and that k8s.context is the one you mean"
+TOO_OLD = "let KubeRay 1.6 or later be installed in the cluster, with its own resource definitions"
 REMEDIES = {
-    "does not exist": "correct k8s.context in the file of targets",
-    "refused": "see that the cluster is up, and that k8s.context or kubectl's current context is the one you mean",
-    "no such host": "see that you reach the cluster, and that k8s.context is the one you mean",
-    "imeout": "see that you reach the cluster, and that k8s.context is the one you mean",
-    "exceeded": "see that you reach the cluster, and that k8s.context is the one you mean",
-    "no matches for kind": "let KubeRay 1.6 or later be installed in the cluster",
-    "have a resource type": "let KubeRay 1.6 or later be installed in the cluster",
-    "unknown field": "let KubeRay 1.6 or later be installed in the cluster, with its own resource definitions",
-    "orbidden": "ask the cluster's administrator for that permission, or choose another k8s.namespace",
+    '" does not exist': "correct k8s.context in the file of targets",
+    "was refused": UNREACHED,
+    "connection refused": UNREACHED,
+    "no such host": UNREACHED,
+    "i/o timeout": UNREACHED,
+    "handshake timeout": UNREACHED,
+    "deadline exceeded": UNREACHED,
+    "Client.Timeout exceeded": UNREACHED,
+    "be logged in": "log in to the cluster, as its administrator says",
+    "exceeded quota": "lower what the file of targets asks for, or ask for a larger quota",
+    "is forbidden": "ask the cluster's administrator for that permission, or choose another k8s.namespace",
+    "no matches for kind": TOO_OLD,
+    "have a resource type": TOO_OLD,
+    "unknown field": TOO_OLD,
     "already exists": "a job of this run and claim is there already; choose another name with --run",
-    "namespaces": "correct k8s.namespace in the file of targets",
+    'namespaces "': "correct k8s.namespace in the file of targets",
 }
 """By words of kubectl, of which the first that it says counts: it has no numbers for them."""
-NOT_SAID = "command terminated with exit code"
+NOT_SAID = re.compile(r"command terminated with exit code|[EWI]\d{4} \d\d:")
+"""Lines that repeat what others say better: of a command inside a pod, and of kubectl's own log."""
 
 
 def at(value: JsonValue, *keys: str | int) -> JsonValue:
@@ -101,9 +110,7 @@ class Kubectl:
                 out, said = process.communicate(text.encode(), timeout=ANSWER_S)
             except subprocess.TimeoutExpired:
                 process.kill()
-                raise RunError(
-                    f"kubectl {arguments[0]} has not ended within {ANSWER_S:.0f} s; {REMEDIES['imeout']}"
-                ) from None
+                raise RunError(f"kubectl {arguments[0]} has not ended within {ANSWER_S:.0f} s; {UNREACHED}") from None
             except BaseException:
                 process.kill()
                 raise
@@ -129,6 +136,6 @@ def _started(call: list[str]) -> subprocess.Popen[bytes]:
 def _refusal(said: str) -> RunError:
     """The error that kubectl's words make, those of a command inside a pod as it said them."""
     lines = [line.removeprefix("error: ").strip() for line in said.splitlines()]
-    words = " ".join(line for line in lines if line and not line.startswith(NOT_SAID) and not line.startswith("E1"))
+    words = " ".join(line for line in lines if line and not NOT_SAID.match(line))
     remedy = next((remedy for known, remedy in REMEDIES.items() if known in words), None)
     return RunError(f"the cluster said: {words or 'nothing'}" + (f"; {remedy}" if remedy else ""))

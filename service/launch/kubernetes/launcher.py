@@ -105,18 +105,17 @@ class KubernetesLauncher:
         self.kubectl.patch("rayjob", job.native_id, [{"op": "add", "path": "/spec/suspend", "value": True}])
 
     def status(self, job: Job) -> Status | None:
-        if self.state(job)[0] is JobState.PENDING:
+        state = self.state(job)[0]
+        if state is JobState.PENDING:
             return None
         known = f"{pods.ROOT}/{job.run}/pool/status.json"
-        with self._place(job) as place:
+        with self._place(job, state) as place:
             command = f"[ ! -e {known} ] || exec t6gps status {job.run} --root {pods.ROOT} --json"
             text = place.execute("sh", "-c", command)
         return json.loads(text) if text.strip() else None
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
-        head = claim.head(self.kubectl, job.native_id)
-        if head is None:
-            raise RunError(f"job {job.name} has no head that runs; see t6gps status {job.name}")
+        head = self._head(job)
         ray_cluster, running_n = _group(self.kubectl, job)
         config = json.loads(head.execute("cat", f"{pods.ROOT}/{job.run}/config.json"))
         pods_n = manifests.pods_for(workers, config["run"]["cpus_per_worker"], self.target)
@@ -161,15 +160,19 @@ class KubernetesLauncher:
     def _rest(self, job: Job, state: JobState, path: str, offset: int) -> Iterator[bytes]:
         """What a job's log has from a byte on."""
         if state is not JobState.PENDING:
-            with self._place(job) as place:
+            with self._place(job, state) as place:
                 yield from place.stream("sh", "-c", f"[ ! -e {path} ] || exec tail --bytes=+{offset + 1} {path}")
 
-    def _place(self, job: Job) -> AbstractContextManager[Place]:
-        """Where the claim is seen: on the head that runs, else in a pod made for it."""
+    def _place(self, job: Job, state: JobState) -> AbstractContextManager[Place]:
+        """Where the claim is seen: on the head of a job that runs, else in a pod made for it."""
+        return nullcontext(self._head(job)) if state is JobState.RUNNING else claim.reader(self.kubectl, self.target)
+
+    def _head(self, job: Job) -> Place:
+        """The head of a job. RunError where none runs."""
         head = claim.head(self.kubectl, job.native_id)
-        if head is not None:
-            return nullcontext(head)
-        return claim.reader(self.kubectl, self.target)
+        if head is None:
+            raise RunError(f"job {job.name} has no head that runs just now; see t6gps jobs, and ask again")
+        return head
 
 
 def _group(kubectl: Kubectl, job: Job) -> tuple[str, int]:

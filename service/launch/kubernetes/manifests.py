@@ -30,8 +30,6 @@ LABEL = "t6gps/job"
 GROUP = "workers"
 RAY_JOB = "t6gps"
 """The job's number in its Ray cluster, where it is the only one."""
-KEEP_S = 30
-"""How long the cluster of a job that has ended stays."""
 OPERATOR = {"app.kubernetes.io/name": "kuberay-operator"}
 DNS_PORT, DASHBOARD_PORT = 53, 8265
 
@@ -179,7 +177,6 @@ def _ray_job(config: Config, run: str, instance: str, target: K8s) -> Manifest:
             "entrypoint": f"bash {JOB}/start.sh {run}",
             "backoffLimit": target.retries,
             "shutdownAfterJobFinishes": True,
-            "ttlSecondsAfterFinished": KEEP_S,
             "rayClusterSpec": _cluster_spec(instance, pods_n, target, mounts, volumes),
         },
     }
