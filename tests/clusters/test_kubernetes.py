@@ -28,6 +28,8 @@ from t6gps.service import config as configuration
 from t6gps.service.launch import job as records
 from t6gps.service.launch.kubernetes import manifests
 from t6gps.service.launch.target import K8s
+from t6gps.service.steering import requests
+from t6gps.storage import catalog
 
 pytestmark = pytest.mark.skipif(
     any(shutil.which(program) is None for program in PROGRAMS) or os.geteuid() != 0,
@@ -70,10 +72,6 @@ class Desk:
     def ray_job(self, run: str) -> dict[str, str | int]:
         """What KubeRay says of a run's job."""
         return self.cluster.store.get("rayjobs", number(run))["status"]
-
-    def paused(self, run: str) -> bool:
-        status = json.loads(t6gps("status", run, "--json", "--root", self.root).stdout)
-        return status.get("state") == "paused"
 
 
 def number(run: str) -> str:
@@ -121,12 +119,12 @@ def test_a_job_scales_outlives_its_head_and_comes_home_with_the_same_bytes(
 ) -> None:
     root = ["--root", desk.root]
     t6gps("submit", "flat-quick", "--to", "k8s", "--run", "long", "--workers", "1", *LONG, *root)
-    wait_until((desk.claim / "long" / "pool" / "status.json").exists, SOON_S)
-    assert desk.state("long")["state"] == "running"
-    t6gps("scale", "long", "0", *root)
-    assert desk.paused("long")
-    assert t6gps("scale", "long", "2", *root).stdout.decode().startswith("run long has 2 workers")
     wait_until(lambda: desk.learned("long"), SOON_S)
+    requests.pause(catalog.open_run(desk.claim, "long"), SOON_S)  # so that it does not end meanwhile
+    status = json.loads(t6gps("status", "long", "--json", *root).stdout)
+    assert (status["job"]["state"], status["state"]) == ("running", "PAUSED")
+    scaled = t6gps("scale", "long", "2", "--deadline", str(SOON_S), *root).stdout.decode()
+    assert scaled.startswith("run long has 2 workers")
     head = desk.cluster.head(number("long"))
     assert head is not None
     assert len(desk.cluster.pods) == 3

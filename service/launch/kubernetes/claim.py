@@ -9,7 +9,7 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
 
-from pydantic import JsonValue
+from pydantic import JsonValue, TypeAdapter
 
 from t6gps.service.launch.fetch import File
 from t6gps.service.launch.kubernetes import manifests, pods
@@ -20,6 +20,7 @@ from t6gps.storage.errors import RunError
 STARTED_S, TICK_S = 300.0, 0.5
 """How long a pod may take to start, image included, and how often it is looked at."""
 STUCK = ("ErrImagePull", "ImagePullBackOff", "InvalidImageName", "CreateContainerConfigError", "CreateContainerError")
+LISTING = TypeAdapter(dict[str, tuple[int, str]])
 
 
 @dataclass(frozen=True)
@@ -34,6 +35,10 @@ class Place:
         """What a command prints there. RunError in its own words where it fails."""
         return self.kubectl.execute(self.pod, self.container, *command)
 
+    def errand(self, name: str, *arguments: str) -> JsonValue:
+        """The answer to an errand there (`launch.errand`)."""
+        return json.loads(self.execute("python3", "-m", "t6gps.service.launch.errand", name, pods.ROOT, *arguments))
+
     def stream(self, *command: str) -> Iterator[bytes]:
         return self.kubectl.stream(self.pod, self.container, *command)
 
@@ -46,8 +51,8 @@ class ClaimSource:
     run: str
 
     def files(self) -> dict[str, File]:
-        listing = self.place.execute("python3", "-m", "t6gps.service.launch.listing", pods.ROOT, self.run)
-        return {path: File(size, sha256) for path, (size, sha256) in json.loads(listing).items()}
+        listing = LISTING.validate_python(self.place.errand("files", self.run))
+        return {path: File(size, sha256) for path, (size, sha256) in listing.items()}
 
     def pieces(self, path: str, offset: int) -> Iterator[bytes]:
         try:

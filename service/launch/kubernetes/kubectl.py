@@ -79,9 +79,9 @@ class Kubectl:
         """Change an object by a JSON patch."""
         self._asked("patch", kind, name, "--type=json", f"--patch={json.dumps(change)}")
 
-    def delete(self, kind: str, name: str, wait: bool = False) -> None:
-        """Remove an object that may be gone already."""
-        self._asked("delete", kind, name, "--ignore-not-found", f"--wait={str(wait).lower()}")
+    def delete(self, kind: str, name: str) -> None:
+        """Let an object go that may be gone already; does not wait."""
+        self._asked("delete", kind, name, "--ignore-not-found", "--wait=false")
 
     def execute(self, pod: str, container: str, *command: str) -> str:
         """What a command inside a container prints."""

@@ -8,7 +8,7 @@ import time
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, contextmanager, nullcontext
 
-from pydantic import JsonValue
+from pydantic import JsonValue, TypeAdapter
 
 from t6gps.service.config import Config
 from t6gps.service.launch import job as records
@@ -23,11 +23,14 @@ from t6gps.service.launch.target import K8s, Kind
 from t6gps.service.steering.status import Status
 from t6gps.storage.errors import ConfigError, RunError
 
-TICK_S, PATIENCE_S = 1.0, 120.0
-"""How often a log is looked at, and how long a head may be gone that is said to run."""
+TICK_S, PATIENCE_S, GONE_S = 1.0, 120.0, 120.0
+"""How often the cluster is looked at, how long a head may be gone that is said to run, and how long removing takes."""
 ALIVE, FAILED = ("Running", "Suspending"), ("Failed", "ValidationFailed")
 """KubeRay's words for jobs that have pods, and for those that it has given up."""
 PID = "/tmp/t6gps.pid"
+NOBODY = "-"
+"""A name that no run can have."""
+STATUS = TypeAdapter(Status | None)
 
 
 class KubernetesLauncher:
@@ -38,7 +41,7 @@ class KubernetesLauncher:
         self.kubectl = Kubectl(target.context, target.namespace)
 
     def check(self, config: Config) -> None:
-        objects = manifests.job(config, "check", self.target)
+        objects = manifests.job(config, NOBODY, self.target)
         self._check_claim()
         for manifest in objects:
             self.kubectl.create(manifest, dry_run=True)
@@ -84,6 +87,8 @@ class KubernetesLauncher:
         while True:
             state = self.state(job)[0]
             ended = not follow or state in ENDED  # asked before the last reading
+            if ended and state is JobState.PENDING:
+                raise RunError(f"job {job.name} has no log yet; see t6gps jobs")
             try:
                 for piece in self._rest(job, state, path, offset):
                     offset += len(piece)
@@ -108,11 +113,8 @@ class KubernetesLauncher:
         state = self.state(job)[0]
         if state is JobState.PENDING:
             return None
-        known = f"{pods.ROOT}/{job.run}/pool/status.json"
         with self._place(job, state) as place:
-            command = f"[ ! -e {known} ] || exec t6gps status {job.run} --root {pods.ROOT} --json"
-            text = place.execute("sh", "-c", command)
-        return json.loads(text) if text.strip() else None
+            return STATUS.validate_python(place.errand("status", job.run))
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
         head = self._head(job)
@@ -121,13 +123,11 @@ class KubernetesLauncher:
         pods_n = manifests.pods_for(workers, config["run"]["cpus_per_worker"], self.target)
         if pods_n > running_n:
             _resize(self.kubectl, ray_cluster, pods_n)
-        head.execute("t6gps", "scale", job.run, str(workers), "--root", pods.ROOT, f"--deadline={deadline_s}")
+        reached = STATUS.validate_python(head.errand("scale", job.run, str(workers), str(deadline_s)))
         if pods_n < running_n:  # workers of a pod that goes move to those that stay
             _resize(self.kubectl, ray_cluster, pods_n)
-        status = self.status(job)
-        if status is None:
-            raise RunError(f"run {job.run} has ended meanwhile; see t6gps status {job.name}")
-        return status
+        assert reached is not None, "it was scaled"
+        return reached
 
     @contextmanager
     def source(self, job: Job) -> Iterator[Source]:
@@ -191,10 +191,15 @@ def _resize(kubectl: Kubectl, ray_cluster: str, pods_n: int) -> None:
 
 def _remove(kubectl: Kubectl, objects: Sequence[Manifest]) -> None:
     """Remove objects, the last first, and see them gone: an object of that name may follow."""
+    deadline = time.monotonic() + GONE_S
     for manifest in reversed(objects):
-        head = manifest["metadata"]
-        assert isinstance(head, dict)
-        kubectl.delete(str(manifest["kind"]), head["name"], wait=True)
+        kind, metadata = str(manifest["kind"]), manifest["metadata"]
+        assert isinstance(metadata, dict)
+        kubectl.delete(kind, metadata["name"])
+        while kubectl.get(kind, metadata["name"]) is not None:
+            if time.monotonic() > deadline:
+                raise RunError(f"{kind} {metadata['name']} is still there after {GONE_S:.0f} s; see what holds it")
+            time.sleep(TICK_S)
 
 
 def _wait(kubectl: Kubectl, job: Job) -> str:
