@@ -25,11 +25,14 @@ from kuberay_cluster import Cluster
 from pods_of_processes import PROGRAMS
 
 from t6gps.service import config as configuration
+from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
+from t6gps.service.launch.fetch import FolderSource
 from t6gps.service.launch.kubernetes import manifests
-from t6gps.service.launch.target import K8s
+from t6gps.service.launch.target import K8s, Kind
 from t6gps.service.steering import requests
 from t6gps.storage import catalog
+from t6gps.storage.catalog import Run
 
 pytestmark = pytest.mark.skipif(
     any(shutil.which(program) is None for program in PROGRAMS) or os.geteuid() != 0,
@@ -168,6 +171,44 @@ def test_a_job_that_is_stopped_is_not_retried_and_is_resumed_by_another(desk: De
     t6gps(*submit, "--resume")
     assert "job stopped is stopped" in t6gps("stop", "stopped", "--root", desk.root).stdout.decode()
     assert desk.state("stopped")["detail"] == "its RayJob is suspended"
+    assert not desk.cluster.pods
+
+
+def ended(desk: Desk, run: str, exit_code: str) -> Run:
+    """A run on the claim whose job has ended and whose RayJob somebody has removed."""
+    made = catalog.create(desk.claim, run, "{}")
+    (made.tables / "a part").write_bytes(bytes(range(256)) * 40)
+    folder = desk.claim / ".jobs" / run
+    folder.mkdir(parents=True)
+    (folder / "exit_code").write_text(exit_code)
+    (folder / "log").write_text("what it said\n")
+    target = K8s(image="t6gps", claim="runs")
+    records.make_state_folder()
+    records.new(Kind.K8S, manifests.name(run, target), folders.of(desk.root, run), "flat-quick", target)
+    return made
+
+
+@pytest.mark.parametrize(
+    ("exit_code", "state"), [("0", "done"), ("130", "stopped"), ("2", "failed"), ("", "failed")], ids=str
+)
+def test_a_job_whose_rayjob_was_removed_ended_as_its_script_wrote(desk: Desk, exit_code: str, state: str) -> None:
+    ended(desk, f"removed-{exit_code}", exit_code)
+    known = {row["run"]: row for row in json.loads(t6gps("jobs", "--json").stdout)}[f"removed-{exit_code}"]
+    assert (known["state"], "was removed" in known["detail"]) == (state, True)
+    assert not desk.cluster.pods
+
+
+def test_a_run_on_a_claim_comes_home_and_a_copy_that_was_cut_off_goes_on(desk: Desk, tmp_path: Path) -> None:
+    run = ended(desk, "cut", "0")
+    begun = tmp_path / "home" / ".fetched" / "cut" / "tables" / "a part"
+    begun.parent.mkdir(parents=True)
+    begun.write_bytes(bytes(range(256)) * 3)
+    t6gps("fetch", "cut", "--root", desk.root, "--to", tmp_path / "home")
+    assert FolderSource(catalog.open_run(tmp_path / "home", "cut")).files() == FolderSource(run).files()
+    assert t6gps("logs", "cut", "--root", desk.root).stdout == b"what it said\n"
+    with catalog.locked(run):
+        said = t6gps("fetch", "cut", "--root", desk.root, "--to", tmp_path / "other", code=2).stderr
+    assert "run cut is in use" in " ".join(said.split())
     assert not desk.cluster.pods
 
 

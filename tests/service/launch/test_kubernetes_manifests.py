@@ -19,7 +19,7 @@ import yaml
 from command import t6gps
 
 from t6gps.service import config as configuration
-from t6gps.service.launch.kubernetes import manifests
+from t6gps.service.launch.kubernetes import claim, manifests
 from t6gps.service.launch.target import K8s
 from t6gps.storage.errors import ConfigError, TerrainError
 
@@ -189,6 +189,21 @@ def test_a_ground_travels_with_the_job_and_a_large_one_is_refused(tmp_path: Path
     source.unlink()
     with pytest.raises(TerrainError, match=r"cannot read ground from .*my hill.npy: No such file"):
         job(f"terrain.file={source}")
+
+
+WAITS = [
+    ({"containerStatuses": [{"state": {"waiting": {"reason": "ImagePullBackOff", "message": "no such image"}}}]},
+     "ImagePullBackOff no such image"),
+    ({"conditions": [{"type": "PodScheduled", "status": "False", "reason": "Unschedulable", "message": "0/3 nodes"}]},
+     "Unschedulable 0/3 nodes"),
+    ({"containerStatuses": [{"state": {"running": {}}}]}, ""),
+    ({}, ""),
+]  # fmt: skip
+
+
+@pytest.mark.parametrize(("status", "words"), WAITS)
+def test_a_pod_that_waits_is_quoted(status: Any, words: str) -> None:
+    assert claim.reason({"status": status}) == words
 
 
 def test_a_dry_run_prints_what_kubectl_takes_and_does_nothing(tmp_path: Path) -> None:
