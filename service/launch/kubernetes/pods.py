@@ -75,7 +75,7 @@ def spec(target: K8s, container: Manifest, volumes: list[Manifest], claim_read_o
             }
         ],
         "volumes": [
-            {"name": "claim", "persistentVolumeClaim": {"claimName": target.claim, "readOnly": claim_read_only}},
+            {"name": "claim", "persistentVolumeClaim": {"claimName": target.claim}},
             {"name": "tmp", "emptyDir": {}},
             {"name": "home", "emptyDir": {}},
             *volumes,
