@@ -117,7 +117,7 @@ def expected(tmp_path_factory: pytest.TempPathFactory) -> dict[str, str]:
 
 @pytest.mark.slow
 @pytest.mark.ray
-def test_a_job_scales_outlives_its_head_and_comes_home_with_the_same_bytes(
+def test_a_job_outlives_its_head_and_comes_home_with_the_same_bytes(
     desk: Desk, expected: dict[str, str], tmp_path: Path, wait_until: Wait
 ) -> None:
     root = ["--root", desk.root]
@@ -126,11 +126,8 @@ def test_a_job_scales_outlives_its_head_and_comes_home_with_the_same_bytes(
     requests.pause(catalog.open_run(desk.claim, "long"), SOON_S)  # so that it does not end meanwhile
     status = json.loads(t6gps("status", "long", "--json", *root).stdout)
     assert (status["job"]["state"], status["state"]) == ("running", "PAUSED")
-    scaled = t6gps("scale", "long", "2", "--deadline", str(SOON_S), *root).stdout.decode()
-    assert scaled.startswith("run long has 2 workers")
     head = desk.cluster.head(number("long"))
     assert head is not None
-    assert len(desk.cluster.pods) == 3
     head.kill()
     log = t6gps("logs", "-f", "long", *root).stdout.decode()
     assert "iteration 7" in log
@@ -143,7 +140,7 @@ def test_a_job_scales_outlives_its_head_and_comes_home_with_the_same_bytes(
 
 @pytest.mark.slow
 @pytest.mark.ray
-def test_a_job_that_is_stopped_is_not_retried_and_is_resumed_by_another(desk: Desk, wait_until: Wait) -> None:
+def test_a_job_scales_with_its_pods_and_one_that_is_stopped_is_not_retried(desk: Desk, wait_until: Wait) -> None:
     submit = [
         "submit",
         "flat-quick",
@@ -159,6 +156,10 @@ def test_a_job_that_is_stopped_is_not_retried_and_is_resumed_by_another(desk: De
     ]
     t6gps(*submit)
     wait_until(lambda: desk.learned("stopped"), SOON_S)
+    assert len(desk.cluster.pods) == 2
+    scaled = t6gps("scale", "stopped", "2", "--deadline", str(SOON_S), "--root", desk.root).stdout.decode()
+    assert scaled.startswith("run stopped has 2 workers")
+    assert len(desk.cluster.pods) == 3
     refused = t6gps(*submit, "--resume", code=2).stderr
     assert "job stopped is running" in " ".join(refused.split())
     assert "stop it, or wait for it to end" in " ".join(
@@ -169,6 +170,9 @@ def test_a_job_that_is_stopped_is_not_retried_and_is_resumed_by_another(desk: De
     assert desk.ray_job("stopped")["failed"] == 0
     assert "everything sampled so far is kept" in t6gps("logs", "stopped", "--root", desk.root).stdout.decode()
     t6gps(*submit, "--resume")
+    shutil.rmtree(desk.root / ".jobs")  # the record of the job is elsewhere
+    refused = t6gps(*submit, code=2).stderr
+    assert "end it with t6gps stop stopped" in " ".join(refused.split())
     assert "job stopped is stopped" in t6gps("stop", "stopped", "--root", desk.root).stdout.decode()
     assert desk.state("stopped")["detail"] == "its RayJob is suspended"
     assert not desk.cluster.pods

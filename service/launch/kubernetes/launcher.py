@@ -19,7 +19,7 @@ from t6gps.service.launch.kubernetes import claim, manifests, pods
 from t6gps.service.launch.kubernetes.claim import ClaimSource, Place
 from t6gps.service.launch.kubernetes.kubectl import Kubectl, at
 from t6gps.service.launch.kubernetes.pods import Manifest
-from t6gps.service.launch.target import K8s, Kind
+from t6gps.service.launch.target import K8s
 from t6gps.service.steering.status import Status
 from t6gps.storage.errors import ConfigError, RunError
 
@@ -53,9 +53,7 @@ class KubernetesLauncher:
         made: list[Manifest] = []
         try:
             for job in planned:
-                before = records.find(job.folder.root, job.folder.run)
-                if before is not None and before.kind is Kind.K8S:  # it has ended, and is resumed
-                    _remove(self.kubectl, self._objects(job))
+                self._make_way(job)
                 for manifest in self._objects(job):
                     self.kubectl.create(manifest)
                     made.append(manifest)
@@ -120,7 +118,7 @@ class KubernetesLauncher:
         head = self._head(job)
         ray_cluster, running_n = _group(self.kubectl, job)
         config = json.loads(head.execute("cat", f"{pods.ROOT}/{job.run}/config.json"))
-        pods_n = manifests.pods_for(workers, config["run"]["cpus_per_worker"], self.target)
+        pods_n = max(1, manifests.pods_for(workers, config["run"]["cpus_per_worker"], self.target))  # fits need CPUs
         if pods_n > running_n:
             _resize(self.kubectl, ray_cluster, pods_n)
         reached = STATUS.validate_python(head.errand("scale", job.run, str(workers), str(deadline_s)))
@@ -139,6 +137,15 @@ class KubernetesLauncher:
     def _objects(self, job: Planned) -> list[Manifest]:
         return manifests.job(job.config, job.folder.run, self.target)
 
+    def _make_way(self, job: Planned) -> None:
+        """Remove the objects of this desk's earlier job of that run. RunError where that has not ended."""
+        before = next((known for known in records.jobs() if known.folder == job.folder), None)
+        if before is None or before.native_id != manifests.name(job.folder.run, self.target):
+            return
+        if (state := self.state(before)[0]) not in ENDED:
+            raise RunError(f"job {before.name} is {state}; end it with t6gps stop {before.name}")
+        _remove(self.kubectl, self._objects(job))
+
     def _check_claim(self) -> None:
         """RunError where the claim is not there, or not for several nodes."""
         found = self.kubectl.get("persistentvolumeclaim", self.target.claim)
@@ -151,11 +158,12 @@ class KubernetesLauncher:
 
     def _outcome(self, job: Job) -> tuple[JobState, str]:
         """How a job ended whose RayJob somebody has removed: what its script wrote on the claim."""
+        path, gone = f"{pods.ROOT}/.jobs/{job.run}/exit_code", f"its RayJob {job.native_id} was removed"
         with claim.reader(self.kubectl, self.target) as place:
-            code = place.execute("sh", "-c", f"cat {pods.ROOT}/.jobs/{job.run}/exit_code 2> /dev/null || true").strip()
-        if not code:
-            return JobState.FAILED, f"its RayJob {job.native_id} was removed before it ended; resume with --resume"
-        return OUTCOMES.get(int(code), JobState.FAILED), f"its RayJob {job.native_id} was removed"
+            code = place.execute("sh", "-c", f"[ ! -e {path} ] || cat {path}").strip()
+        return (
+            (OUTCOMES.get(int(code), JobState.FAILED), gone) if code else (JobState.FAILED, f"{gone} before it ended")
+        )
 
     def _rest(self, job: Job, state: JobState, path: str, offset: int) -> Iterator[bytes]:
         """What a job's log has from a byte on."""
