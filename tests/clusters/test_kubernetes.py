@@ -182,6 +182,7 @@ def ended(desk: Desk, run: str, exit_code: str) -> Run:
     """A run on the claim whose job has ended and whose RayJob somebody has removed."""
     made = catalog.create(desk.claim, run, "{}")
     (made.tables / "a part").write_bytes(bytes(range(256)) * 40)
+    (made.tables / "large").write_bytes(bytes(range(251)) * 4000)
     folder = desk.claim / ".jobs" / run
     folder.mkdir(parents=True)
     (folder / "exit_code").write_text(exit_code)
@@ -204,9 +205,10 @@ def test_a_job_whose_rayjob_was_removed_ended_as_its_script_wrote(desk: Desk, ex
 
 def test_a_run_on_a_claim_comes_home_and_a_copy_that_was_cut_off_goes_on(desk: Desk, tmp_path: Path) -> None:
     run = ended(desk, "cut", "0")
-    begun = tmp_path / "home" / ".fetched" / "cut" / "tables" / "a part"
-    begun.parent.mkdir(parents=True)
-    begun.write_bytes(bytes(range(256)) * 3)
+    begun = tmp_path / "home" / ".fetched" / "cut" / "tables"
+    begun.mkdir(parents=True)
+    for name in ("a part", "large"):
+        (begun / name).write_bytes((run.tables / name).read_bytes()[:1000])
     t6gps("fetch", "cut", "--root", desk.root, "--to", tmp_path / "home")
     assert FolderSource(catalog.open_run(tmp_path / "home", "cut")).files() == FolderSource(run).files()
     assert t6gps("logs", "cut", "--root", desk.root).stdout == b"what it said\n"

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import io
+import itertools
 import json
 import secrets
 import time
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 from pydantic import JsonValue, TypeAdapter
 
@@ -20,6 +22,8 @@ from t6gps.storage.errors import RunError
 STARTED_S, TICK_S = 300.0, 0.5
 """How long a pod may take to start, image included, and how often it is looked at."""
 STUCK = ("ErrImagePull", "ImagePullBackOff", "InvalidImageName", "CreateContainerConfigError", "CreateContainerError")
+SMALL_BYTES, TOGETHER_N = 1 << 18, 64
+"""What counts as a small file, and how many of them come at once."""
 LISTING = TypeAdapter(dict[str, tuple[int, str]])
 
 
@@ -43,22 +47,37 @@ class Place:
         return self.kubectl.stream(self.pod, self.container, *command)
 
 
-@dataclass(frozen=True)
+@dataclass
 class ClaimSource:
-    """A run on a claim, as `fetch` asks for it."""
+    """A run on a claim, as `fetch` asks for it. Small files come many at once: each call of kubectl takes a while."""
 
     place: Place
     run: str
+    listed: dict[str, File] = field(default_factory=dict)
+    waiting: dict[str, bytes] = field(default_factory=dict)
 
     def files(self) -> dict[str, File]:
         listing = LISTING.validate_python(self.place.errand("files", self.run))
-        return {path: File(size, sha256) for path, (size, sha256) in listing.items()}
+        self.listed = {path: File(size, sha256) for path, (size, sha256) in listing.items()}
+        return self.listed
 
     def pieces(self, path: str, offset: int) -> Iterator[bytes]:
         try:
+            if self.listed[path].size <= SMALL_BYTES:
+                if path not in self.waiting:
+                    self.waiting = self._together(path)
+                yield self.waiting.pop(path)[offset:]
+                return
             yield from self.place.stream("tail", f"--bytes=+{offset + 1}", f"{pods.ROOT}/{self.run}/{path}")
         except RunError as error:
             raise ConnectionError(str(error)) from error
+
+    def _together(self, first: str) -> dict[str, bytes]:
+        """A small file and those that follow it in the listing."""
+        following = itertools.dropwhile(lambda path: path != first, self.listed)
+        paths = [path for path in following if self.listed[path].size <= SMALL_BYTES][:TOGETHER_N]
+        content = io.BytesIO(b"".join(self.place.stream("cat", *(f"{pods.ROOT}/{self.run}/{path}" for path in paths))))
+        return {path: content.read(self.listed[path].size) for path in paths}
 
 
 def head(kubectl: Kubectl, instance: str) -> Place | None:
