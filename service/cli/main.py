@@ -10,7 +10,6 @@ from __future__ import annotations
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -34,7 +33,7 @@ from t6gps.service.cli.options import (
 )
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
-from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training import origin, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
@@ -140,24 +139,28 @@ def evaluate(
     episodes: Annotated[int, typer.Option(min=2, help="Noise-free episodes.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and waypoints; never one of training.")] = 1,
     terrain_seed: Annotated[int | None, typer.Option(min=0, help="Seed of the ground alone.")] = None,
+    version: Annotated[
+        int | None, typer.Option("--policy", min=0, help="Version of the policy; by default the newest.")
+    ] = None,
+    no_keep: Annotated[bool, typer.Option("--no-keep", help="Leave the run's tables as they are.")] = False,
     overrides: Overrides = None,
     workers: Workers = None,
     serial: Serial = False,
     engine: Annotated[Engine, typer.Option(help="mujoco cross-checks, as with --serial.")] = Engine.BULLET,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's newest policy without noise on unseen seeds."""
+    """Evaluate a run's policy without noise on unseen seeds, and keep the episodes."""
     run = catalog.open_run(root, run_name)
     config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
-    with (
-        closing(session.restored(config, run, serial, engine)) as executor,
-        terminal.ProgressDisplay(config.run.iterations) as display,
-    ):
-        result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
+    asked = session.Asked(episodes, seed, terrain_seed, version, keep=not no_keep)
+    with terminal.ProgressDisplay(config.run.iterations) as display:
+        result, number = session.evaluate(run, config, asked, serial, engine, display)
     if as_json:
         typer.echo(result.to_json())
     else:
         terminal.print_evaluation(result)
+    if number is not None:
+        terminal.say(f"kept as evaluation {number}: see the table evaluations, or t6gps render with --evaluation")
 
 
 @app.command()

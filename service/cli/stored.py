@@ -10,13 +10,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
 from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, Server
-from t6gps.service.training import origin, session
+from t6gps.service.training import evaluation_records, origin, session
 from t6gps.service.training.summary import RunSummary
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
@@ -105,6 +104,9 @@ def render(
     episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
     out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
     root: Root = DEFAULT_ROOT,
+    evaluation_id: Annotated[
+        int | None, typer.Option("--evaluation", min=0, help="Evaluation that the episode is of.")
+    ] = None,
     step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
     strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
 ) -> None:
@@ -114,14 +116,14 @@ def render(
     from t6gps.workers.pictures.scene import Sizes
 
     run = catalog.open_run(root, run_name)
-    frames = tables.episode_frames(run, episode)
-    row = tables.read(run, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
+    config = origin.configured(run) if evaluation_id is None else evaluation_records.world(run, evaluation_id)
+    stored = tables.episode(run, episode, evaluation_id)
+    row = stored.summary.to_pylist()[0]
     session.tell_changes(run, terminal.warn)
-    config = origin.configured(run)
     terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
     sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
     with terminal.task("rendering") as progress:
-        rendering.render(frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
+        rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)
 
 

@@ -63,6 +63,8 @@ class Job(BaseModel):
 def outcome(folder: Folder) -> tuple[JobState, str]:
     """How a job ended that is no longer there, and what its log said last."""
     code = folder.exit_code
+    if code is None and not folder.log.exists():
+        return JobState.FAILED, f"ended without a word or a log; let its nodes share the root {folder.root}"
     if code is None:
         return JobState.FAILED, f"ended without a word, killed or lost; see {folder.log}, resume with --resume"
     state = OUTCOMES.get(code, JobState.FAILED)

@@ -8,13 +8,17 @@ from t6gps.service.launch.kubernetes.launcher import KubernetesLauncher
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.local import LocalLauncher
 from t6gps.service.launch.slurm import SlurmLauncher
-from t6gps.service.launch.target import K8s, Slurm, Target
+from t6gps.service.launch.target import K8s, Ray, Slurm, Target
 
 
 def of(target: Target) -> Launcher:
     """The launcher of a target."""
     if isinstance(target, Slurm):
         return SlurmLauncher(target)
+    if isinstance(target, Ray):
+        from t6gps.service.launch.ray_jobs import RayLauncher  # it loads Ray
+
+        return RayLauncher(target)
     return KubernetesLauncher(target) if isinstance(target, K8s) else LocalLauncher()
 
 

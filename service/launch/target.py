@@ -51,6 +51,16 @@ class Slurm(Settings):
     )
 
 
+class Ray(Settings):
+    """A cluster of Ray that is up, by its Jobs API. Its token comes from the environment, as for Ray itself."""
+
+    address: str = Field("http://127.0.0.1:8265", pattern=r"^https?://[^/\s]+$", description="http://HEAD:8265")
+    root: str | None = Field(
+        None, pattern=r"^/", description="folder of the runs on the cluster, where this machine does not see it"
+    )
+    bin: str | None = Field(None, pattern=r"^/", description="folder of the programs t6gps and python on the nodes")
+
+
 DNS_LABEL = r"^[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?$"
 DNS_NAME = r"^[a-z0-9]([-.a-z0-9]{0,251}[a-z0-9])?$"
 
@@ -74,19 +84,18 @@ class K8s(Settings):
     retries: int = Field(3, ge=0, le=100, description="times that a job is started anew whose head was lost")
 
 
-Target = Local | Slurm | K8s
-TARGETS: dict[Kind, type[Local] | type[Slurm] | type[K8s]] = {
+Target = Local | Ray | Slurm | K8s
+TARGETS: dict[Kind, type[Local] | type[Ray] | type[Slurm] | type[K8s]] = {
     Kind.LOCAL: Local,
+    Kind.RAY: Ray,
     Kind.SLURM: Slurm,
     Kind.K8S: K8s,
 }
-"""What is known of each kind; a kind that is not here cannot be launched on yet."""
+"""What is known of each kind."""
 
 
 def read(kind: Kind, file: Path | None) -> Target:
     """The target of a kind that a file describes, or its defaults without one. ConfigError for what is not allowed."""
-    if kind not in TARGETS:
-        raise ConfigError(f"--to {kind}: not supported by this version; allowed: {', '.join(TARGETS)}")
     return parse(kind, {} if file is None else _section(kind, file), str(file))
 
 

@@ -13,13 +13,12 @@ from fastapi import APIRouter, Header, HTTPException, Path
 from fastapi.responses import JSONResponse, Response, StreamingResponse
 from starlette.types import Receive, Scope, Send
 
-from t6gps.service.api import policy as policies
 from t6gps.service.remote.messages import QueryForm, QueryRequest
 from t6gps.service.server import updates
 from t6gps.service.server.access import REFUSALS, NamedRun, Place, Reading, Slots
 from t6gps.service.steering import status as statuses
 from t6gps.service.steering.status import Status
-from t6gps.service.training import evaluation, summary
+from t6gps.service.training import evaluation, policies, summary
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
 from t6gps.storage import catalog, checkpoint
@@ -87,7 +86,7 @@ def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> Respo
 @routes.get("/{name}/policies")
 def versions(run: NamedRun) -> list[int]:
     """Versions of the policies that are kept."""
-    return sorted(checkpoint.kept(run.checkpoints))
+    return policies.versions(run)
 
 
 @routes.get(
@@ -97,10 +96,10 @@ def versions(run: NamedRun) -> list[int]:
 )
 def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)], place: Place) -> Response:
     """Weights of a policy: `offset_m`, `scale_m`, and `weight_K`, `bias_K` of each layer."""
-    if version not in checkpoint.kept(run.checkpoints):
+    if version not in policies.versions(run):
         raise HTTPException(HTTPStatus.NOT_FOUND, f"run {run.name} keeps no policy of version {version}")
     with place.reading.taken():
-        snapshot = policies.load(run, version).snapshot
+        snapshot = policies.load(run, version)
     arrays = {"offset_m": np.array(snapshot.offset_m), "scale_m": np.array(snapshot.scale_m)}
     weights = {f"weight_{k}": weight for k, (weight, _) in enumerate(snapshot.layers)}
     biases = {f"bias_{k}": bias for k, (_, bias) in enumerate(snapshot.layers)}
@@ -109,7 +108,7 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)
 
 @routes.post("/{name}/query", response_class=Response, responses=_contents(MEDIA.values(), "The result."))
 def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
-    """The result of one SELECT over the tables frames, episodes, iterations and classes."""
+    """The result of one SELECT over the tables of a run."""
     if question.form is QueryForm.HEAD:
         with place.reading.taken():
             return JSONResponse(asdict(sql.head(run, question.sql)))

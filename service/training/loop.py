@@ -26,11 +26,12 @@ from t6gps.learner.port import Manifest
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
-from t6gps.storage import checkpoint, tables
+from t6gps.storage import checkpoint
 from t6gps.storage.catalog import Run
 from t6gps.storage.checkpoint import JSON
+from t6gps.storage.delta import iterations
 from t6gps.storage.errors import LearnerDiedError, RunError
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, Learned, PolicySnapshot
 from t6gps.storage.spool import Spool, read
 
 LEARNER_DEATHS_ALLOWED_N = 3
@@ -122,12 +123,14 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         with _timed(durations, phase.duration_column):
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase.name, done, total)
-    learned, classes = executor.learner.report()
+    report = executor.learner.report()
     summaries = pa.concat_tables([read(path).summary.take([0]) for path in files]).combine_chunks()
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
-    row |= _sampled(summaries) | learned | durations
+    row |= _sampled(summaries) | report.iteration | durations
     row["left_out"] = len(plans) - len(files)
-    tables.commit_iteration(run, iteration, _tended(executor, files), row, classes)
+    policies = [executor.learner.policy()] if iteration else [batch.snapshot, executor.learner.policy()]
+    learned = Learned(row, report.classes, report.models, policies)
+    iterations.commit(run, iteration, _tended(executor, files), learned)
     state = executor.learner.state()
     manifest = cast(dict[str, JSON], {**state.manifest, "ledger": executor.ledger.state()})
     checkpoint.save(run.checkpoints, iteration + 1, manifest, state.arrays)
