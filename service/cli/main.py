@@ -7,6 +7,7 @@ matplotlib) is imported by the commands that need it, so that the others answer 
 
 from __future__ import annotations
 
+import logging
 import shlex
 import sys
 from collections.abc import Sequence
@@ -15,7 +16,7 @@ from typing import Annotated, NoReturn
 
 import typer
 
-from t6gps.service import advice
+from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
 from t6gps.service.cli import doctor, launching, live, serving, stored
@@ -31,6 +32,7 @@ from t6gps.service.cli.options import (
     Workers,
     with_workers,
 )
+from t6gps.service.logs import Role, Speaker
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
 from t6gps.service.training import origin, session
@@ -42,13 +44,15 @@ from t6gps.storage.errors import T6GpsError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
-EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_MISTAKE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+_log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; `t6gps.__main__` has prepared the process, whose arguments are taken where none are given."""
     try:
         try:
+            logs.begin(Speaker(logs.chosen()))
             app(arguments)
         finally:
             sys.stdout.flush()  # a full disk is told of below
@@ -58,9 +62,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         message = advice.sentence(error)
     except KeyboardInterrupt:  # before or after the command itself
         sys.exit(EXIT_INTERRUPTED)
+    except Exception:  # a mistake of ours
+        if not logs.as_json():
+            raise
+        _log.critical("the command has made a mistake; report it", exc_info=True)
+        sys.exit(EXIT_MISTAKE)
     else:
         return
-    terminal.say(f"error: {message}", style="red")
+    terminal.say(message, logging.ERROR)
     sys.exit(EXIT_BAD_INPUT)
 
 
@@ -83,7 +92,9 @@ def train(
         serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
         return
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
+    logs.become(Role.SUPERVISOR, run_name)
     run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
+    logs.become(Role.SUPERVISOR, run.name)
     try:
         with terminal.ProgressDisplay(config.run.iterations) as display:
             result = session.complete(config, run, serial, display)
@@ -151,6 +162,7 @@ def evaluate(
 ) -> None:
     """Evaluate a run's policy without noise on unseen seeds, and keep the episodes."""
     run = catalog.open_run(root, run_name)
+    logs.become(Role.SUPERVISOR, run.name)
     config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
     asked = session.Asked(episodes, seed, terrain_seed, version, keep=not no_keep)
     with terminal.ProgressDisplay(config.run.iterations) as display:

@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
+from t6gps.service import logs
 from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.target import Kind
 from t6gps.storage import catalog, durable
@@ -77,7 +78,7 @@ def last_words(folder: Folder) -> str:
         lines = folder.log.read_text(errors="replace").split("\n")
     except OSError:
         return f"it has no log {folder.log}"
-    return next((line.strip() for line in reversed(lines) if line.strip()), "its log is empty")
+    return next((logs.said(line.strip()) for line in reversed(lines) if line.strip()), "its log is empty")
 
 
 def state_folder() -> Path:

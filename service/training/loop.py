@@ -11,6 +11,7 @@ they have sampled is in the spool when the iteration's turn comes, which then re
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -36,6 +37,9 @@ from t6gps.storage.spool import Spool, read
 
 LEARNER_DEATHS_ALLOWED_N = 3
 """In one iteration."""
+COMMIT = "commit"
+"""The phase in which an iteration is committed and its checkpoint is written."""
+_log = logging.getLogger(__name__)
 
 
 class Observer(Protocol):
@@ -69,10 +73,11 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
                 _iterate(config, run, executor, observer, iteration)
                 deaths_n = 0
             return
-        except LearnerDiedError:
+        except LearnerDiedError as error:
             deaths_n += 1
             if deaths_n > LEARNER_DEATHS_ALLOWED_N:
                 raise
+            _log.warning("%s; another one resumes from the newest checkpoint", error)
             executor.replace_learner()
 
 
@@ -147,7 +152,7 @@ def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) 
 def _tended(executor: Executor, files: Sequence[Path]) -> Iterator[Episode]:
     """Episodes one after the other; the pool is tended meanwhile."""
     for file in files:
-        executor.tend()
+        executor.tend(COMMIT)
         yield read(file)
 
 

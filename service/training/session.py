@@ -9,11 +9,12 @@ from enum import StrEnum
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from t6gps.service import caller, checks
+from t6gps.service import caller, checks, logs
 from t6gps.service import config as configuration
 from t6gps.service.checks import Wanted
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
+from t6gps.service.logs import Role
 from t6gps.service.pool.state import RunState
 from t6gps.service.steering.watch import heeding
 from t6gps.service.training import evaluation, evaluation_records, loop, origin, policies
@@ -111,7 +112,8 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
     Everything sampled is kept when KeyboardInterrupt comes, also by `t6gps stop`. A run is removed whose first executor
     does not start.
     """
-    with catalog.locked(run), _named(run):
+    speaker = logs.other(Role.SUPERVISOR, run.name)
+    with catalog.locked(run), _named(run), logs.speaking(speaker):
         config = origin.at_work(config, run)
         try:
             with heeding(run):
