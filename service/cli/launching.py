@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import json
 import time
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 from typing import Annotated
 
@@ -17,6 +18,7 @@ from t6gps.service.launch import fetch as fetching
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers, submission
 from t6gps.service.launch import target as targets
+from t6gps.service.launch.fetch import FolderSource, Source
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.target import Kind
@@ -70,8 +72,7 @@ def submit(
     launcher = launchers.of(target)
     planned = submission.plan(source, with_workers(overrides, workers, autoscale), root, run_name, seeds, resume)
     if dry_run:
-        folders = [job.folder for job in planned]
-        typer.echo(f"# {folders[0].config}\n{planned[0].config.to_toml()}\n{launcher.render(folders)}")
+        typer.echo(f"# {planned[0].folder.config}\n{planned[0].config.to_toml()}\n{launcher.render(planned)}")
         return
     launcher.check(planned[0].config)
     for job in submission.submit(launcher, to, target, source, planned):
@@ -136,8 +137,10 @@ def fetch(
 ) -> None:
     """Bring a run home: whole, verified, and continued where an earlier copy was cut off."""
     job = records.find(root, name)
-    source = fetching.FolderSource(catalog.open_run(root, name)) if job is None else launchers.serving(job).source(job)
-    with terminal.task("fetching") as progress:
+    opened: AbstractContextManager[Source] = (
+        nullcontext(FolderSource(catalog.open_run(root, name))) if job is None else launchers.serving(job).source(job)
+    )
+    with opened as source, terminal.task("fetching") as progress:
         copy = fetching.fetch(source, to, run_name or (name if job is None else job.run), progress)
     typer.echo(copy.path)
 

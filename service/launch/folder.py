@@ -66,6 +66,14 @@ class Folder:
         (self.path / "exit_code").write_text(f"{exit_code}\n")
 
 
+@dataclass(frozen=True)
+class Planned:
+    """A job to be: what it trains, and its folder, which is not there yet."""
+
+    config: Config
+    folder: Folder
+
+
 def of(root: Path, run: str) -> Folder:
     """The folder of the job that trains a run, whether it is there or not."""
     return Folder(catalog.whole(root) / FOLDERS / catalog.check_name(run))

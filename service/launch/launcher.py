@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 from t6gps.service.config import Config
 from t6gps.service.launch.fetch import Source
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import Job, JobState
 from t6gps.service.steering.status import Status
 
@@ -19,12 +20,12 @@ class Launcher(Protocol):
         """ConfigError or RunError for a run that this target cannot take; nothing is changed."""
         ...
 
-    def render(self, folders: Sequence[Folder]) -> str:
+    def render(self, planned: Sequence[Planned]) -> str:
         """What `submit` would do, as commands and files to read."""
         ...
 
-    def submit(self, folders: Sequence[Folder]) -> list[str]:
-        """Start a job for each of these prepared folders; their numbers on the target."""
+    def submit(self, planned: Sequence[Planned]) -> list[str]:
+        """Start a job for each of these, whose folders are prepared; their numbers on the target."""
         ...
 
     def state(self, job: Job) -> tuple[JobState, str]:
@@ -51,6 +52,6 @@ class Launcher(Protocol):
         """Give the run of a job `workers` workers, and wait for them; its status then. Errors as `requests.scale`."""
         ...
 
-    def source(self, job: Job) -> Source:
-        """Where the files of the run of a job come from."""
+    def source(self, job: Job) -> AbstractContextManager[Source]:
+        """Where the files of the run of a job come from, for the time of the context."""
         ...

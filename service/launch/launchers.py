@@ -4,10 +4,11 @@ from __future__ import annotations
 
 from t6gps.service.launch import target as targets
 from t6gps.service.launch.job import Job
+from t6gps.service.launch.kubernetes.launcher import KubernetesLauncher
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.local import LocalLauncher
 from t6gps.service.launch.slurm import SlurmLauncher
-from t6gps.service.launch.target import Ray, Slurm, Target
+from t6gps.service.launch.target import K8s, Ray, Slurm, Target
 
 
 def of(target: Target) -> Launcher:
@@ -18,7 +19,7 @@ def of(target: Target) -> Launcher:
         from t6gps.service.launch.ray_jobs import RayLauncher  # it loads Ray
 
         return RayLauncher(target)
-    return LocalLauncher()
+    return KubernetesLauncher(target) if isinstance(target, K8s) else LocalLauncher()
 
 
 def serving(job: Job) -> Launcher:

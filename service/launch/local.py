@@ -13,7 +13,7 @@ from contextlib import suppress
 from pathlib import Path
 
 from t6gps.service.config import Config
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import Job, JobState, outcome
 from t6gps.service.launch.visible import VisibleLauncher
 from t6gps.service.ray_backend import processes
@@ -26,11 +26,12 @@ class LocalLauncher(VisibleLauncher):
     def check(self, config: Config) -> None:
         """Nothing can be wrong here that the run would not say."""
 
-    def render(self, folders: Sequence[Folder]) -> str:
+    def render(self, planned: Sequence[Planned]) -> str:
+        folders = [job.folder for job in planned]
         return "\n".join(f"{shlex.join(_call(folder))} >> {shlex.quote(str(folder.log))} 2>&1 &" for folder in folders)
 
-    def submit(self, folders: Sequence[Folder]) -> list[str]:
-        return [_started(folder) for folder in folders]
+    def submit(self, planned: Sequence[Planned]) -> list[str]:
+        return [_started(job.folder) for job in planned]
 
     def state(self, job: Job) -> tuple[JobState, str]:
         pid = _pid(job)

@@ -9,7 +9,7 @@ from __future__ import annotations
 import json
 import tempfile
 from collections.abc import Iterator, Sequence
-from contextlib import suppress
+from contextlib import AbstractContextManager, suppress
 from functools import cached_property
 from pathlib import Path
 from typing import TypeVar
@@ -22,7 +22,7 @@ from t6gps.service.config import Config
 from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch.fetch import Source
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import OUTCOMES, Job, JobState
 from t6gps.service.launch.target import Ray
 from t6gps.service.launch.visible import VisibleLauncher
@@ -62,13 +62,15 @@ class RayLauncher(VisibleLauncher):
     def check(self, config: Config) -> None:
         self.api  # noqa: B018  connects
 
-    def render(self, folders: Sequence[Folder]) -> str:
+    def render(self, planned: Sequence[Planned]) -> str:
         first = [] if self.target.root is None else [f"# the jobs' folders are brought to {self.target.root} first"]
         options = f"--address {self.target.address} --no-wait --runtime-env-json '{json.dumps(jobs_api.ENVIRONMENT)}'"
+        folders = [job.folder for job in planned]
         calls = [jobs_api.entrypoint(self._command(folder), self.target.bin) for folder in folders]
         return "\n".join([*first, *(f"ray job submit {options} -- {call}" for call in calls)])
 
-    def submit(self, folders: Sequence[Folder]) -> list[str]:
+    def submit(self, planned: Sequence[Planned]) -> list[str]:
+        folders = [job.folder for job in planned]
         config = configuration.load(str(folders[0].config))
         root, script = (str(path) for path in (self._there(folders[0]).root, folders[0].script))
         survey = self._errand(SURVEY, "look", root, script)
@@ -118,7 +120,7 @@ class RayLauncher(VisibleLauncher):
             return super().scale(job, workers, deadline_s)
         return self._errand(REACHED, "scale", self.target.root, job.run, str(workers), str(deadline_s))
 
-    def source(self, job: Job) -> Source:
+    def source(self, job: Job) -> AbstractContextManager[Source]:
         if self.target.root is None:
             return super().source(job)
         raise RunError(

@@ -11,7 +11,7 @@ from importlib.resources import as_file
 from pathlib import Path
 
 from t6gps.service.config import Config
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import STOPPED, Job, JobState, outcome
 from t6gps.service.launch.target import Slurm
 from t6gps.service.launch.visible import VisibleLauncher
@@ -41,17 +41,17 @@ class SlurmLauncher(VisibleLauncher):
         with _script() as script:
             _asked("sbatch", "--test-only", *_options(self.target), str(script), remedy="correct the file of targets")
 
-    def render(self, folders: Sequence[Folder]) -> str:
+    def render(self, planned: Sequence[Planned]) -> str:
         with _script() as script:
-            call = shlex.join(["sbatch", *self._arguments(folders, script)])
+            call = shlex.join(["sbatch", *self._arguments(planned, script)])
             return f"{call}\n\n# {script.name}\n{script.read_text()}"
 
-    def submit(self, folders: Sequence[Folder]) -> list[str]:
+    def submit(self, planned: Sequence[Planned]) -> list[str]:
         with _script() as script:
-            number = _asked("sbatch", *self._arguments(folders, script)).strip().partition(";")[0]
-        if len(folders) == 1:
+            number = _asked("sbatch", *self._arguments(planned, script)).strip().partition(";")[0]
+        if len(planned) == 1:
             return [number]
-        return [f"{number}_{task}" for task in range(len(folders))]
+        return [f"{number}_{task}" for task in range(len(planned))]
 
     def state(self, job: Job) -> tuple[JobState, str]:
         try:
@@ -78,8 +78,9 @@ class SlurmLauncher(VisibleLauncher):
     def cancel(self, job: Job) -> None:
         _cancelled(job.native_id)
 
-    def _arguments(self, folders: Sequence[Folder], script: Path) -> list[str]:
+    def _arguments(self, planned: Sequence[Planned], script: Path) -> list[str]:
         """What follows `sbatch`: one job, or an array with a task for each folder, named RUN-seedTASK."""
+        folders = [job.folder for job in planned]
         first, several = folders[0], len(folders) > 1
         log = first.log.parent.with_name(first.run.removesuffix("0") + "%a") / "log" if several else first.log
         array = [f"--array=0-{len(folders) - 1}"] if several else []

@@ -4,29 +4,19 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from contextlib import ExitStack
-from dataclasses import dataclass
 from pathlib import Path
 
 from t6gps.service import config as configuration
-from t6gps.service.config import Config
 from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.target import Kind, Target
 from t6gps.service.training import session
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
-
-
-@dataclass(frozen=True)
-class Planned:
-    """A job to be: what it trains, and its folder, which is not there yet."""
-
-    config: Config
-    folder: Folder
 
 
 def plan(
@@ -60,7 +50,7 @@ def submit(launcher: Launcher, kind: Kind, target: Target, source: str, planned:
     with ExitStack() as stack:
         for job in planned:
             stack.enter_context(folders.prepared(job.config, job.folder))
-        numbers = launcher.submit(each)
+        numbers = launcher.submit(planned)
         submitted: list[Job] = []
         try:
             for folder, number in zip(each, numbers, strict=True):

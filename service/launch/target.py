@@ -15,6 +15,7 @@ import sys
 import tomllib
 from enum import StrEnum
 from pathlib import Path
+from typing import Literal
 
 from pydantic import Field, ValidationError
 
@@ -60,15 +61,41 @@ class Ray(Settings):
     bin: str | None = Field(None, pattern=r"^/", description="folder of the programs t6gps and python on the nodes")
 
 
-Target = Local | Ray | Slurm
-TARGETS: dict[Kind, type[Local] | type[Ray] | type[Slurm]] = {Kind.LOCAL: Local, Kind.RAY: Ray, Kind.SLURM: Slurm}
-"""What is known of each kind; a kind that is not here cannot be launched on yet."""
+DNS_LABEL = r"^[a-z0-9]([-a-z0-9]{0,61}[a-z0-9])?$"
+DNS_NAME = r"^[a-z0-9]([-.a-z0-9]{0,251}[a-z0-9])?$"
+
+
+class K8s(Settings):
+    """A namespace of a Kubernetes cluster with KubeRay, and a claim there that holds the root of runs."""
+
+    image: str = Field(pattern=r"^\S+$", description="image with t6gps, its user has the number 1000")
+    claim: str = Field(pattern=DNS_NAME, description="PersistentVolumeClaim, ReadWriteMany, that holds the runs")
+    context: str | None = Field(None, min_length=1, description="context of kubectl; without it the current one")
+    namespace: str = Field("default", pattern=DNS_LABEL, description="namespace")
+    service_account: str | None = Field(None, pattern=DNS_NAME, description="service account of the pods")
+    image_pull_policy: Literal["Always", "IfNotPresent", "Never"] | None = Field(
+        None, description="Always, IfNotPresent or Never"
+    )
+    head_cpus: int = Field(2, ge=1, le=1024, description="CPUs of the head, which learns and runs no workers")
+    head_memory_gb: int = Field(8, ge=2, le=4096, description="memory of the head (GiB)")
+    cpus_per_pod: int = Field(4, ge=1, le=1024, description="CPUs of each pod with workers")
+    memory_gb_per_pod: int = Field(8, ge=2, le=4096, description="memory of each pod with workers (GiB)")
+    pods: int = Field(8, ge=1, le=1000, description="most pods with workers of a run")
+    retries: int = Field(3, ge=0, le=100, description="times that a job is started anew whose head was lost")
+
+
+Target = Local | Ray | Slurm | K8s
+TARGETS: dict[Kind, type[Local] | type[Ray] | type[Slurm] | type[K8s]] = {
+    Kind.LOCAL: Local,
+    Kind.RAY: Ray,
+    Kind.SLURM: Slurm,
+    Kind.K8S: K8s,
+}
+"""What is known of each kind."""
 
 
 def read(kind: Kind, file: Path | None) -> Target:
     """The target of a kind that a file describes, or its defaults without one. ConfigError for what is not allowed."""
-    if kind not in TARGETS:
-        raise ConfigError(f"--to {kind}: not supported by this version; allowed: {', '.join(TARGETS)}")
     return parse(kind, {} if file is None else _section(kind, file), str(file))
 
 

@@ -5,14 +5,15 @@ from __future__ import annotations
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from t6gps.service.config import Config
+from t6gps.service.launch import errand
 from t6gps.service.launch.fetch import FolderSource, Source
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.steering import requests
-from t6gps.service.steering import status as statuses
 from t6gps.service.steering.status import Status
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
@@ -28,10 +29,10 @@ class VisibleLauncher(ABC):
     def check(self, config: Config) -> None: ...
 
     @abstractmethod
-    def render(self, folders: Sequence[Folder]) -> str: ...
+    def render(self, planned: Sequence[Planned]) -> str: ...
 
     @abstractmethod
-    def submit(self, folders: Sequence[Folder]) -> list[str]: ...
+    def submit(self, planned: Sequence[Planned]) -> list[str]: ...
 
     @abstractmethod
     def state(self, job: Job) -> tuple[JobState, str]: ...
@@ -59,16 +60,13 @@ class VisibleLauncher(ABC):
             raise RunError(f"job {job.name} has no log {path} yet; see t6gps jobs") from None
 
     def status(self, job: Job) -> Status | None:
-        if not catalog.exists(Path(job.root), job.run):
-            return None
-        run = _run(job)
-        return statuses.status(run) if (run.pool / "status.json").exists() else None
+        return errand.status(job.root, job.run)
 
     def scale(self, job: Job, workers: int, deadline_s: float) -> Status:
         return requests.scale(_run(job), workers, deadline_s)
 
-    def source(self, job: Job) -> Source:
-        return FolderSource(_run(job))
+    def source(self, job: Job) -> AbstractContextManager[Source]:
+        return nullcontext(FolderSource(_run(job)))
 
 
 def _run(job: Job) -> Run:

@@ -114,12 +114,6 @@ def test_a_cluster_that_cannot_be_used_gives_one_error_and_nothing_is_left(
     assert not records.jobs()
 
 
-@pytest.mark.parametrize("kind", ["k8s"])
-def test_a_kind_of_target_that_is_not_supported_yet_is_refused(tmp_path: Path, kind: str) -> None:
-    done = t6gps("submit", "flat-quick", "--to", kind, "--root", tmp_path / "runs", code=2)
-    assert "allowed: local, ray, slurm" in " ".join(done.stderr.split())
-
-
 def test_a_root_that_cannot_hold_jobs_is_refused(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     done = t6gps("submit", "flat-quick", "--root", tmp_path / "file", code=2)
