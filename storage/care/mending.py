@@ -54,6 +54,24 @@ def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[
     return sentences
 
 
+def tables_from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[Fault]) -> list[str]:
+    """Take whole tables from a copy that has no less of them; what was done.
+
+    Single files did not help, so tables contradict each other, and none says which of them is right.
+    """
+    sentences, spoilt = [], {fault.part for fault in unsound}
+    if not any(fault.part in schema.TABLES for fault in faults):
+        return sentences
+    for table in (name for name in schema.TABLES if name not in spoilt and (copy.tables / name).exists()):
+        here, there = (delta_files.opened(run, table).committed_n for run in (draft, copy))
+        if there >= here:
+            place = f"tables/{table}"
+            set_aside(draft, place)
+            _take(copy.path / place, draft.path / place)
+            sentences.append(f"{place} is taken from {copy.path}")
+    return sentences
+
+
 def _check_same(draft: Run, copy: Run, damaged: set[str]) -> None:
     compared = [part for part in ("config", "origin") if part not in damaged]
     for part in compared:

@@ -54,8 +54,10 @@ def _mended(
     shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=_link)
     sentences = []
     if copy is not None:
-        sentences += mending.from_copy(draft, copy, faults, verify(copy))
-        faults = verify(draft)
+        unsound = verify(copy)
+        for take in (mending.from_copy, mending.tables_from_copy):
+            sentences += take(draft, copy, faults, unsound)
+            faults = verify(draft)
     for way in (mending.rebuilt_logs, mending.from_spool, losses.without):
         done = way(draft, faults)
         if done:
