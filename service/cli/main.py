@@ -19,7 +19,7 @@ import typer
 from t6gps.service import advice
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import doctor, launching, live, serving, stored
+from t6gps.service.cli import doctor, door, launching, live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -37,7 +37,6 @@ from t6gps.service.studies.declared import Scale
 from t6gps.service.training import evaluation, origin, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
-from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import T6GpsError
 
@@ -137,6 +136,7 @@ def study(
 def evaluate(
     run_name: RunName,
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     episodes: Annotated[int, typer.Option(min=2, help="Noise-free episodes.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and waypoints; never one of training.")] = 1,
     terrain_seed: Annotated[int | None, typer.Option(min=0, help="Seed of the ground alone.")] = None,
@@ -147,13 +147,13 @@ def evaluate(
     as_json: Json = False,
 ) -> None:
     """Evaluate a run's newest policy without noise on unseen seeds."""
-    run = catalog.open_run(root, run_name)
-    config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
-    with (
-        closing(session.restored(config, run, serial, engine)) as executor,
-        terminal.ProgressDisplay(config.run.iterations) as display,
-    ):
-        result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
+    with door.opened(root, server) as there, there.at_hand(run_name) as run:
+        config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
+        with (
+            closing(session.restored(config, run, serial, engine)) as executor,
+            terminal.ProgressDisplay(config.run.iterations) as display,
+        ):
+            result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
     if as_json:
         typer.echo(result.to_json())
     else:

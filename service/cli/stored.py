@@ -10,7 +10,6 @@ from enum import StrEnum
 from pathlib import Path
 from typing import Annotated
 
-import pyarrow.compute as pc
 import typer
 
 from t6gps.service import config as configuration
@@ -105,6 +104,7 @@ def render(
     episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
     out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
     strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
 ) -> None:
@@ -113,15 +113,14 @@ def render(
     from t6gps.workers.pictures import render as rendering
     from t6gps.workers.pictures.scene import Sizes
 
-    run = catalog.open_run(root, run_name)
-    frames = tables.episode_frames(run, episode)
-    row = tables.read(run, "episodes", filter=pc.field("episode_id") == episode).to_pylist()[0]
-    session.tell_changes(run, terminal.warn)
-    config = origin.configured(run)
-    terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
-    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
-    with terminal.task("rendering") as progress:
-        rendering.render(frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
+    with door.opened(root, server) as there, there.at_hand(run_name) as run:
+        frames, row = there.episode(run_name, episode)
+        session.tell_changes(run, terminal.warn)
+        config = origin.configured(run)
+        terrain = ground(config.terrain, int(str(row["terrain_seed"])), float(str(row["terrain_difficulty"])))
+        sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+        with terminal.task("rendering") as progress:
+            rendering.render(frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)
 
 

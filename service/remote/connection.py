@@ -31,7 +31,7 @@ KINDS: dict[str, type[T6GpsError]] = {
     kind.__name__: kind for kind in (ConfigError, RunError, DataError, CheckpointError, QueryError, TerrainError)
 }
 """Errors that a server may tell, by their names; any other is a ServerError."""
-ANSWER_S, CONNECT_S = 2 * WAIT_S, 10.0
+ANSWER_S, CONNECT_S = 3 * WAIT_S, 10.0
 """A server that says nothing for so long is said to be silent."""
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
@@ -80,9 +80,14 @@ class Connection:
         with self._streamed("POST", path, json=request.model_dump(mode="json")) as answer:
             yield from answer.iter_bytes()
 
-    def events(self, path: str, last: int) -> Iterator[Update]:
+    def pieces(self, path: str, offset: int) -> Iterator[bytes]:
+        """What is there from a byte on, as it comes."""
+        with self._streamed("GET", path, headers={"Range": f"bytes={offset}-"} if offset else None) as answer:
+            yield from answer.iter_bytes()
+
+    def events(self, path: str, last: str) -> Iterator[Update]:
         """Events of a stream after `last`, until the server ends it. ServerError where the connection breaks."""
-        with self._streamed("GET", path, headers={"Last-Event-ID": str(last)}) as answer:
+        with self._streamed("GET", path, headers={"Last-Event-ID": last}) as answer:
             yield from parsed(answer.iter_lines())
 
     @contextmanager

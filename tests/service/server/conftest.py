@@ -32,7 +32,7 @@ def serve(tmp_path: Path, make_episode: Callable[..., Episode]) -> Iterator[Call
             now = datetime.now(UTC)
             texts = {scope: tokens.issue(run.path.parent, asked, now).token for scope, asked in requests.items()}
             server = Server("", run, texts)
-            application = app.create(server.root, launch=server.launch, now=server.now, limits=limits)
+            application = app.create(server.root, start=server.launch, now=server.now, limits=limits)
             server.url = stack.enter_context(listening(application, stalled_s))
             return server
 

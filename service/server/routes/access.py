@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -14,9 +14,12 @@ from fastapi import Depends, HTTPException, Path, Request
 from fastapi.security import HTTPBearer
 from pydantic import JsonValue
 
+from t6gps.service.launch import job as records
+from t6gps.service.launch.job import Job
 from t6gps.service.remote.messages import Refusal, RunName, Scope
 from t6gps.service.server import audit
-from t6gps.service.server.jobs import Launch
+from t6gps.service.server.feed import Feeds
+from t6gps.service.server.launching import Launch
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
@@ -73,13 +76,14 @@ class Slots:
 
 @dataclass(frozen=True)
 class Served:
-    """What a server serves: a root, what starts the process of a run, and room for heavy work."""
+    """What a server serves: a root, what lets a job train a run, what is listened to, and room for heavy work."""
 
     root: Folder
     launch: Launch
     reading: Slots = field(default_factory=lambda: Slots(READING_N))
     operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
     streams: Slots = field(default_factory=lambda: Slots(STREAMS_N))
+    feeds: Feeds = field(default_factory=Feeds)
 
 
 def _served(request: Request) -> Served:
@@ -121,7 +125,20 @@ Administration = Annotated[dict[str, JsonValue], Depends(_changing(Scope.ADMIN))
 """Of a route that changes something: what the audit shall say of it, beside who and when."""
 
 
-def _named(place: Place, name: Annotated[RunName, Path(description="Name of a run.")]) -> Run:
+def contents(kinds: Iterable[str], what: str) -> Answers:
+    """What a route answers with that is no JSON, for the document."""
+    return {200: {"content": {kind: {} for kind in kinds}, "description": what}}
+
+
+Name = Annotated[RunName, Path(description="Name of a run.")]
+
+
+def training(place: Served, name: str) -> Job | None:
+    """The job that trains a run of the root."""
+    return records.training(place.root, name)
+
+
+def _named(place: Place, name: Name) -> Run:
     try:
         return catalog.open_run(place.root, name)
     except RunError as error:

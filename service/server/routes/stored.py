@@ -1,32 +1,31 @@
-"""Routes that change nothing."""
+"""Routes that give what runs have stored: figures, policies, results of queries, and files."""
 
 from __future__ import annotations
 
+import io
 import tempfile
-from collections.abc import AsyncIterator, Iterable
 from dataclasses import asdict
 from http import HTTPStatus
+from pathlib import Path as FilePath
 from typing import Annotated
 
 import numpy as np
-from fastapi import APIRouter, Header, HTTPException, Path
-from fastapi.responses import JSONResponse, Response, StreamingResponse
-from starlette.types import Receive, Scope, Send
+import pyarrow as pa
+from fastapi import APIRouter, HTTPException, Path, Query
+from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 
 from t6gps.service.api import policy as policies
+from t6gps.service.launch.fetch import File, FolderSource
 from t6gps.service.remote.messages import QueryForm, QueryRequest
-from t6gps.service.server import updates
-from t6gps.service.server.access import REFUSALS, NamedRun, Place, Reading, Slots
-from t6gps.service.steering import status as statuses
-from t6gps.service.steering.status import Status
-from t6gps.service.training import evaluation, summary
+from t6gps.service.server.routes.access import REFUSALS, NamedRun, Place, Reading, contents
+from t6gps.service.training import evaluation
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.service.training.summary import Row, RunSummary
-from t6gps.storage import catalog, checkpoint
+from t6gps.storage import checkpoint, tables
+from t6gps.storage.catalog import Run
 from t6gps.storage.sql import query as sql
 
 routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS, tags=["read"])
-ITERATIONS_MOST = 10**9
+NUMBER_MOST = 10**9
 CHUNK_BYTES_N = 2**16
 ARCHIVE = "application/octet-stream"
 MEDIA = {
@@ -34,31 +33,6 @@ MEDIA = {
     QueryForm.CSV: "text/csv",
     QueryForm.JSON: "application/json",
 }
-
-
-def _contents(kinds: Iterable[str], what: str) -> dict[int | str, dict[str, object]]:
-    """What a route answers with, for the document."""
-    return {200: {"content": {kind: {} for kind in kinds}, "description": what}}
-
-
-@routes.get("")
-def runs(place: Place) -> list[RunSummary]:
-    """The runs, damaged ones included."""
-    with place.reading.taken():
-        return [summary.summary(run) for run in catalog.list_runs(place.root)]
-
-
-@routes.get("/{name}/status")
-def status(run: NamedRun) -> Status:
-    """How a run is: its workers, what is under way, who waits for whom and since when."""
-    return statuses.status(run)
-
-
-@routes.get("/{name}/metrics")
-def metrics(run: NamedRun, place: Place) -> list[Row]:
-    """The learning curve: rows of the table `iterations`."""
-    with place.reading.taken():
-        return summary.iterations(run)
 
 
 @routes.get("/{name}/evaluation")
@@ -73,7 +47,7 @@ def figures(run: NamedRun) -> list[str]:
     return sorted(path.name for path in run.figures.glob("*.png"))
 
 
-@routes.get("/{name}/figures/{figure}", response_class=Response, responses=_contents(["image/png"], "A picture."))
+@routes.get("/{name}/figures/{figure}", response_class=Response, responses=contents(["image/png"], "A picture."))
 def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> Response:
     """A figure as PNG."""
     found = {path.name: path for path in run.figures.glob("*.png")}
@@ -93,9 +67,9 @@ def versions(run: NamedRun) -> list[int]:
 @routes.get(
     "/{name}/policies/{version}",
     response_class=Response,
-    responses=_contents([ARCHIVE], "An .npz archive without pickle."),
+    responses=contents([ARCHIVE], "An .npz archive without pickle."),
 )
-def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)], place: Place) -> Response:
+def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=NUMBER_MOST)], place: Place) -> Response:
     """Weights of a policy: `offset_m`, `scale_m`, and `weight_K`, `bias_K` of each layer."""
     if version not in checkpoint.kept(run.checkpoints):
         raise HTTPException(HTTPStatus.NOT_FOUND, f"run {run.name} keeps no policy of version {version}")
@@ -107,7 +81,7 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=ITERATIONS_MOST)
     return Response(checkpoint.packed({**arrays, **weights, **biases}), media_type=ARCHIVE)
 
 
-@routes.post("/{name}/query", response_class=Response, responses=_contents(MEDIA.values(), "The result."))
+@routes.post("/{name}/query", response_class=Response, responses=contents(MEDIA.values(), "The result."))
 def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
     """The result of one SELECT over the tables frames, episodes, iterations and classes."""
     if question.form is QueryForm.HEAD:
@@ -123,32 +97,46 @@ def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
 
 
 @routes.get(
-    "/{name}/events",
-    response_class=StreamingResponse,
-    responses=_contents(["text/event-stream"], "Events."),
+    "/{name}/episodes/{number}", response_class=Response, responses=contents([MEDIA[QueryForm.ARROW]], "An IPC stream.")
 )
-async def events(
-    run: NamedRun,
-    place: Place,
-    last_event_id: Annotated[int, Header(ge=updates.NONE, le=ITERATIONS_MOST)] = updates.NONE,
-) -> StreamingResponse:
-    """Live updates as server-sent events: iterations with their ids, changes of the status."""
-    place.streams.take()
+def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], place: Place) -> Response:
+    """The frames of an episode, bit for bit."""
+    sink = io.BytesIO()
+    with place.reading.taken():
+        frames = tables.episode_frames(run, number)
+    with pa.ipc.new_stream(sink, frames.schema) as writer:
+        writer.write_table(frames)
+    return Response(sink.getvalue(), media_type=MEDIA[QueryForm.ARROW])
 
-    return _Stream(updates.stream(run, last_event_id), place.streams)
+
+@routes.get("/{name}/files")
+def files(run: NamedRun, place: Place, whole: bool = True) -> dict[str, File]:
+    """The files of a run that nobody trains, by their paths in it; or else only those that its policy acts with."""
+    with place.reading.taken():
+        source = FolderSource(run)
+        return source.files() if whole else source.essentials()
 
 
-class _Stream(StreamingResponse):
-    """A stream of events, which gives its slot back however it ends."""
+@routes.get(
+    "/{name}/file",
+    response_class=FileResponse,
+    responses=contents([ARCHIVE], "Its content.")
+    | {206: {"content": {ARCHIVE: {}}, "description": "The range that was asked for."}}
+    | {416: {"content": {"text/plain": {}}, "description": "There is no such range."}},
+)
+def file(run: NamedRun, path: Annotated[str, Query(max_length=1000)]) -> FileResponse:
+    """A file of a run, or a range of it."""
+    found = _file(run, path)
+    if found is None:
+        raise HTTPException(HTTPStatus.NOT_FOUND, f"run {run.name} has no file {path!r}; see its list of files")
+    return FileResponse(found, media_type=ARCHIVE)
 
-    media_type = "text/event-stream"
 
-    def __init__(self, events: AsyncIterator[str], slots: Slots) -> None:
-        super().__init__(events, headers={"Cache-Control": "no-store"})
-        self._slots = slots
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._slots.give_back()
+def _file(run: Run, path: str) -> FilePath | None:
+    """A file by its path in a run, None for what names none of those that `files` lists."""
+    try:
+        inside, found = run.path.resolve(), (run.path / path).resolve()
+        known = found.is_relative_to(inside) and found.is_file() and not path.startswith((".", "/"))
+        return found if known and ".." not in FilePath(path).parts else None
+    except (OSError, ValueError):  # too long, or with a NUL
+        return None
