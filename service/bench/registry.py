@@ -17,14 +17,15 @@ BENCHMARKS = {
     "learner": "t6gps.service.bench.learner",
     "physics": "t6gps.workers.bench.physics",
     "pool": "t6gps.service.bench.pool",
+    "server": "t6gps.service.bench.server",
     "soundness": "t6gps.workers.bench.soundness",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
-SIZED = ("pool",)
+SIZED = ("pool", "server")
 """Benchmarks that can be told how long and how often to measure."""
-LONG = ("learner", "pool")
+LONG = ("learner", "pool", "server")
 """Benchmarks that say how far they are."""
 
 

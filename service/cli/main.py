@@ -164,8 +164,12 @@ def evaluate(
 def bench(
     name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
     root: Root = DEFAULT_ROOT,
-    seconds: Annotated[float | None, typer.Option(help="pool: seconds of each measurement; 30 by default.")] = None,
-    rounds: Annotated[int | None, typer.Option(help="pool: measurements of each contender; 5 by default.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="pool, server: seconds of each measurement; 30 by default.")
+    ] = None,
+    rounds: Annotated[
+        int | None, typer.Option(help="pool, server: measurements of each contender; 5 by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure speed, each figure beside a reference of the same run."""

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -86,7 +86,7 @@ class Served:
     feeds: Feeds = field(default_factory=Feeds)
 
 
-def _served(request: Request) -> Served:
+async def _served(request: Request) -> Served:  # async: what reads no file needs no thread
     return cast(Served, request.app.state.served)
 
 
@@ -101,8 +101,8 @@ def _check(request: Request, scope: Scope) -> None:
         raise HTTPException(HTTPStatus.FORBIDDEN, sentence)
 
 
-def _asking(scope: Scope) -> Callable[..., None]:
-    def check(request: Request, _: Annotated[object, Depends(_bearer)]) -> None:
+def _asking(scope: Scope) -> Callable[..., Awaitable[None]]:
+    async def check(request: Request, _: Annotated[object, Depends(_bearer)]) -> None:
         _check(request, scope)
 
     return check

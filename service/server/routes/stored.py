@@ -17,7 +17,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 from t6gps.service.api import policy as policies
 from t6gps.service.launch.fetch import File, FolderSource
 from t6gps.service.remote.messages import QueryForm, QueryRequest
-from t6gps.service.server.routes.access import REFUSALS, NamedRun, Place, Reading, contents
+from t6gps.service.server.routes.access import REFUSALS, Answers, NamedRun, Place, Reading, contents
 from t6gps.service.training import evaluation
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import checkpoint, tables
@@ -47,15 +47,24 @@ def figures(run: NamedRun) -> list[str]:
     return sorted(path.name for path in run.figures.glob("*.png"))
 
 
-@routes.get("/{name}/figures/{figure}", response_class=Response, responses=contents(["image/png"], "A picture."))
-def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> Response:
+RANGES: Answers = {
+    206: {"content": {ARCHIVE: {}}, "description": "The range that was asked for."},
+    416: {"content": {"text/plain": {}}, "description": "There is no such range."},
+}
+"""How else a file may be answered."""
+
+
+@routes.get(
+    "/{name}/figures/{figure}", response_class=FileResponse, responses=contents(["image/png"], "A picture.") | RANGES
+)
+def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> FileResponse:
     """A figure as PNG."""
     found = {path.name: path for path in run.figures.glob("*.png")}
     if figure not in found:
         raise HTTPException(
             HTTPStatus.NOT_FOUND, f"there is no figure {figure!r}; figures: {', '.join(found) or 'none'}"
         )
-    return Response(found[figure].read_bytes(), media_type="image/png")
+    return FileResponse(found[figure], media_type="image/png")
 
 
 @routes.get("/{name}/policies")
@@ -117,13 +126,7 @@ def files(run: NamedRun, place: Place, whole: bool = True) -> dict[str, File]:
         return source.files() if whole else source.essentials()
 
 
-@routes.get(
-    "/{name}/file",
-    response_class=FileResponse,
-    responses=contents([ARCHIVE], "Its content.")
-    | {206: {"content": {ARCHIVE: {}}, "description": "The range that was asked for."}}
-    | {416: {"content": {"text/plain": {}}, "description": "There is no such range."}},
-)
+@routes.get("/{name}/file", response_class=FileResponse, responses=contents([ARCHIVE], "Its content.") | RANGES)
 def file(run: NamedRun, path: Annotated[str, Query(max_length=1000)]) -> FileResponse:
     """A file of a run, or a range of it."""
     found = _file(run, path)

@@ -20,8 +20,11 @@ from t6gps.storage.records import Episode
 
 
 @pytest.fixture
-def serve(tmp_path: Path, make_episode: Callable[..., Episode]) -> Iterator[Callable[..., Server]]:
+def serve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_episode: Callable[..., Episode]
+) -> Iterator[Callable[..., Server]]:
     """serve(limits, stalled_s) starts a server of a root with the run `walk`, which has committed two iterations."""
+    monkeypatch.setenv("T6GPS_STATE", str(tmp_path / "state"))
     with ExitStack() as stack:
 
         def start(limits: Limits = PATIENT, stalled_s: float = STALLED_S) -> Server:

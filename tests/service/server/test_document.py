@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, assume, given, settings
@@ -15,8 +17,8 @@ ENDLESS = "/v1/runs/{name}/events"
 """A stream has no end; its tests are in test_updates.py."""
 BEYOND = [schemathesis.checks.positive_data_acceptance]
 """Not asked: which settings and which SQL there are is beyond what a document can say."""
-EXAMPLES_N = 8
-"""Of each route, within what its document allows and beyond it."""
+EXAMPLES_N = int(os.environ.get("T6GPS_API_EXAMPLES", "8"))
+"""Of each route, within what its document allows and beyond it; `make api` asks for more."""
 
 
 @pytest.mark.slow

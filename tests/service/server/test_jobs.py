@@ -83,6 +83,7 @@ def sampled(run: Run) -> list[Path]:
     return list(run.spool.glob("iteration-*/episode-*.arrow"))
 
 
+@pytest.mark.slow
 def test_a_run_has_one_job_whose_end_is_told_and_leaves_no_zombie(
     client: Client, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None]
 ) -> None:
