@@ -11,7 +11,7 @@ import pyarrow as pa
 
 from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import Source
-from t6gps.service.remote import source
+from t6gps.service.remote import following, source
 from t6gps.service.remote.client import Client
 from t6gps.service.remote.source import FarSource
 from t6gps.service.steering.events import Event
@@ -55,7 +55,7 @@ class Far:
         return self.client.history(name)
 
     def follow(self, name: str) -> Iterator[Event]:
-        for update in self.client.events(name):
+        for update in following.updates(self.client, name):
             if update.kind == "fault":
                 raise RunError(str(update.data))
             if update.kind == "pool":
@@ -65,7 +65,7 @@ class Far:
         return self.client.jobs()
 
     def logs(self, name: str, follow: bool) -> Iterator[str]:
-        return self.client.logs(name, follow)
+        return following.logs(self.client, name, follow)
 
     def table(self, name: str, table: str) -> pa.Table:
         return self.client.table(name, table)

@@ -79,9 +79,9 @@ def submit(
         typer.echo(f"job {job.name} is submitted to {job.kind} as {job.native_id}; follow it: t6gps logs -f {job.name}")
 
 
-def jobs(root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
+def jobs(server: Server = None, as_json: Json = False) -> None:
     """List the jobs that you have submitted, or those of a server's runs, and how each is."""
-    with door.opened(root, server) as there:
+    with door.opened(DEFAULT_ROOT, server) as there:
         rows = [job.model_dump(mode="json") for job in there.jobs()]
     if as_json:
         typer.echo(json.dumps(rows))

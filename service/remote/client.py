@@ -5,10 +5,8 @@ with Client("https://gps.example.org:8686") as client: client.status("rough")
 
 from __future__ import annotations
 
-import codecs
 import io
 import os
-import time
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from types import TracebackType
@@ -24,7 +22,6 @@ from t6gps.service import config as configuration
 from t6gps.service.api.policy import Policy
 from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import File
-from t6gps.service.launch.job import ENDED
 from t6gps.service.remote.administration import Administration
 from t6gps.service.remote.connection import Connection, checked
 from t6gps.service.remote.messages import (
@@ -48,7 +45,7 @@ from t6gps.storage import catalog
 from t6gps.storage.records import PolicySnapshot
 from t6gps.storage.sql.query import Head
 
-TOKEN_VARIABLE, LOOK_S = "T6GPS_TOKEN", 0.5
+TOKEN_VARIABLE = "T6GPS_TOKEN"
 
 
 @final
@@ -108,21 +105,9 @@ class Client:
         """The jobs that train runs of the server."""
         return self._server.get("/jobs", list[JobLine])
 
-    def logs(self, name: str, follow: bool = False, look_s: float = LOOK_S) -> Iterator[str]:
-        """What the job of a run has written so far; with `follow` also what it goes on to write, until it ends."""
-        decoder, after = codecs.getincrementaldecoder("utf-8")("replace"), 0
-        while True:
-            ended = not follow or self._ended(name)
-            while piece := self._server.ask("GET", f"{_run(name)}/logs?after={after}"):
-                after += len(piece)
-                yield decoder.decode(piece)
-            if ended:  # asked before the last reading
-                return
-            time.sleep(look_s)
-
-    def _ended(self, name: str) -> bool:
-        job = self.standing(name).job
-        return job is None or job.state in ENDED
+    def log(self, name: str, after: int) -> bytes:
+        """What the job of a run has written after so many bytes, a piece; nothing where that is all so far."""
+        return self._server.ask("GET", f"{_run(name)}/logs?after={after}")
 
     def history(self, name: str) -> list[Event]:
         """What happened to a run's workers and episodes, each with its reason."""
@@ -181,17 +166,11 @@ class Client:
         """The result of one SELECT."""
         sink = io.BytesIO()
         self.write(name, sql, QueryForm.ARROW, sink)
-        return self._table(sink.getvalue())
+        return self._server.table(sink.getvalue())
 
     def episode(self, name: str, number: int) -> pa.Table:
         """The frames of an episode, bit for bit."""
-        return self._table(self._server.ask("GET", f"{_run(name)}/episodes/{int(number)}"))
-
-    def _table(self, stream: bytes) -> pa.Table:
-        try:
-            return pa.ipc.open_stream(stream).read_all()
-        except pa.ArrowException as error:
-            raise self._server.nonsense(error) from None
+        return self._server.table(self._server.ask("GET", f"{_run(name)}/episodes/{int(number)}"))
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""

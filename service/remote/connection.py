@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import TypeVar, final
 
 import httpx
+import pyarrow as pa
 from pydantic import BaseModel, JsonValue, TypeAdapter, ValidationError
 
 from t6gps.service.remote.messages import WAIT_S, Refusal
@@ -35,6 +36,10 @@ ANSWER_S, CONNECT_S = 3 * WAIT_S, 10.0
 """A server that says nothing for so long is said to be silent."""
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
+
+
+class UnreachableError(ServerError):
+    """A server that cannot be reached, or with which the connection has broken."""
 
 
 @final
@@ -103,15 +108,22 @@ class Connection:
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
 
+    def table(self, stream: bytes) -> pa.Table:
+        """The table of an IPC stream that was answered."""
+        try:
+            return pa.ipc.open_stream(stream).read_all()
+        except pa.ArrowException as error:
+            raise self.nonsense(error) from None
+
     def nonsense(self, error: Exception) -> ServerError:
         """The error for an answer that cannot be understood."""
         line = str(error).splitlines()[0]
         return ServerError(f"server {self.url} answers what is not understood here ({line}); use the same t6gps as it")
 
-    def _unreachable(self, error: httpx.HTTPError) -> ServerError:
+    def _unreachable(self, error: httpx.HTTPError) -> UnreachableError:
         if isinstance(error, httpx.ReadTimeout):
-            return ServerError(f"server {self.url} has not answered within {ANSWER_S:.0f} s; see its log")
-        return ServerError(
+            return UnreachableError(f"server {self.url} has not answered within {ANSWER_S:.0f} s; see its log")
+        return UnreachableError(
             f"server {self.url} cannot be reached: {error}; correct the address, or start one with t6gps serve"
         )
 

@@ -24,8 +24,9 @@ from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
-READING_N, OPERATING_N, STREAMS_N = 2, 8, 64
-"""How much may be under way at once: queries and the like, changes that wait for their effect, streams of events."""
+READING_N, COPYING_N, OPERATING_N, STREAMS_N = 2, 2, 8, 64
+"""How much may be under way at once: queries and the like, lists of files with their digests, changes that wait for
+their effect, streams of events."""
 Answers: TypeAlias = dict[int | str, dict[str, object]]
 REFUSED = (
     HTTPStatus.BAD_REQUEST,
@@ -81,6 +82,7 @@ class Served:
     root: Folder
     launch: Launch
     reading: Slots = field(default_factory=lambda: Slots(READING_N))
+    copying: Slots = field(default_factory=lambda: Slots(COPYING_N))
     operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
     streams: Slots = field(default_factory=lambda: Slots(STREAMS_N))
     feeds: Feeds = field(default_factory=Feeds)

@@ -121,7 +121,7 @@ def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
 @routes.get("/{name}/files")
 def files(run: NamedRun, place: Place, whole: bool = True) -> dict[str, File]:
     """The files of a run that nobody trains, by their paths in it; or else only those that its policy acts with."""
-    with place.reading.taken():
+    with place.copying.taken():
         source = FolderSource(run)
         return source.files() if whole else source.essentials()
 

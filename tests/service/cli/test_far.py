@@ -110,7 +110,7 @@ def asked(place: tuple[Path, str], command: str, arguments: list[str], code: int
     """What a command says on its streams, with the root and through the server; names of both places aside."""
     root, url = place
     said = []
-    for where in (["--root", str(root)], ["--server", url]):
+    for where in ([] if command == "jobs" else ["--root", str(root)], ["--server", url]):
         done = t6gps(command, *arguments, *where, code=code)
         table = done.stdout[done.stdout.find("┏".encode()) :] if command == "runs" else done.stdout
         said.append((table.partition(b"dataset  ")[0], done.stderr))  # folders are told here alone

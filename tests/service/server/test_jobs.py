@@ -16,6 +16,7 @@ from t6gps.service.api import policy
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
 from t6gps.service.launch.job import JobState
+from t6gps.service.remote import following
 from t6gps.service.remote.client import Client
 from t6gps.service.remote.messages import Scope, TokenRequest
 from t6gps.service.server import app, tokens
@@ -98,7 +99,7 @@ def test_a_run_has_one_job_whose_end_is_told_and_leaves_no_zombie(
     with ThreadPoolExecutor() as threads:
         assert all("is running" in sentence for sentence in threads.map(resume, range(6)))
     (job,) = client.jobs()
-    assert "no Ray answers" in "".join(client.logs("far", follow=True, look_s=0.1))
+    assert "no Ray answers" in "".join(following.logs(client, "far", follow=True, look_s=0.1))
     ended = client.standing("far").job
     assert ended is not None and ended.state is JobState.FAILED
     assert "no Ray answers" in ended.detail

@@ -3,14 +3,18 @@
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from loopback import Server, commit
 
+from t6gps.service.remote import following
+from t6gps.service.remote.client import Client
+from t6gps.service.remote.connection import UnreachableError
 from t6gps.service.remote.messages import Scope
 from t6gps.service.remote.stream import START, Update, parsed
 from t6gps.service.server.routes.access import STREAMS_N
@@ -46,6 +50,45 @@ def test_who_was_cut_off_goes_on_after_the_last_id_and_hears_everything_once(
     told = [update.data for update in heard if update.kind == "pool"]
     assert [event["reason"] for event in told] == [str(number) for number in range(40)]
     assert len({update.id for update in heard}) == len(heard) == 44
+
+
+class Breaking(httpx.BaseTransport):
+    """A way to a server on which every stream of events breaks after its first event."""
+
+    def __init__(self) -> None:
+        self.way, self.ids = httpx.HTTPTransport(), list[str]()
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        answer = self.way.handle_request(request)
+        self.ids.append(request.headers["Last-Event-ID"])
+        return httpx.Response(answer.status_code, headers=answer.headers, stream=Cut(answer.stream))
+
+
+class Cut(httpx.SyncByteStream):
+    def __init__(self, whole: Iterable[bytes]) -> None:
+        self.whole = whole
+
+    def __iter__(self) -> Iterator[bytes]:
+        for piece in self.whole:
+            yield piece
+            if b"event:" in piece:
+                raise httpx.ReadError("the connection is cut")
+
+
+def test_who_keeps_listening_hears_each_once_over_connections_that_break(server: Server) -> None:
+    log = EventLog(server.run.pool)
+    for number in range(3):
+        log.write([Happened(EventKind.HANG, str(number))], "sampling")
+    way = Breaking()
+    with Client(server.url, server.tokens[Scope.READ], transport=way) as client:
+        heard = list(islice(following.updates(client, "walk", look_s=0.01), 5))
+    assert [update.id for update in heard] == ["0-1", "0-2", "0-3", "1-3", "2-3"]
+    assert way.ids == [START, "0-1", "0-2", "0-3", "1-3"]
+
+
+def test_a_server_that_stays_out_of_reach_is_one_error() -> None:
+    with Client("http://127.0.0.1:1", "token") as client, pytest.raises(UnreachableError, match="cannot be reached"):
+        next(following.updates(client, "walk", patience_s=0.05, look_s=0.01))
 
 
 def test_listeners_share_what_was_seen_and_each_hears_it_all(
