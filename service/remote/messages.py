@@ -67,7 +67,7 @@ class StartRequest(Message):
     """
 
     preset: Preset | None = None
-    toml: Annotated[str, StringConstraints(max_length=100_000)] | None = None
+    toml: Annotated[str, StringConstraints(max_length=20_000)] | None = None
     name: RunName | None = None
     default_name: RunName | None = None
     settings: dict[Key, Scalar | list[Scalar]] = Field(default={}, max_length=100)

@@ -46,6 +46,6 @@ def test_whatever_is_asked_is_answered_as_the_document_says(server: Server, mode
                 case.path_parameters["name"] = server.run.name  # else every route says that there is no such run
             head = case.meta.components.get(ParameterLocation.HEADER)
             assume(head is None or head.mode is GenerationMode.POSITIVE)  # tokens are tested in test_access.py
-            case.call_and_validate(headers=headers, excluded_checks=BEYOND)
+            case.call_and_validate(headers=headers, excluded_checks=BEYOND, timeout=120)
 
         answered()
