@@ -1,4 +1,4 @@
-"""Renders tables into README.md and the pages of docs: measured figures, and the states of workers and runs.
+"""Renders tables into README.md and the pages of docs: measured figures, states of workers and runs, metrics, alerts.
 
 A page says where a table goes; what stands between the two markers is replaced:
 
@@ -6,6 +6,9 @@ A page says where a table goes; what stands between the two markers is replaced:
     <!-- end -->
 
     <!-- states: NAME -->       one of STATES, as the code has it: each member, its docstring, and what may follow
+    <!-- end -->
+
+    <!-- metrics -->            the metrics of /metrics; <!-- alerts --> the rules of deploy/prometheus/alerts.yml
     <!-- end -->
 
 A file in docs/figures is one measurement:
@@ -35,13 +38,18 @@ from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
+import yaml
+
+from t6gps.service.monitoring.metrics import METRICS
 from t6gps.service.pool.attempt import FailureKind
 from t6gps.service.pool.state import NEXT_PHASES, NEXT_STATES, Ending, RunState, WorkerPhase
 from t6gps.service.steering.events import EventKind
 
 REPOSITORY = Path(__file__).parents[1]
 FIGURES = REPOSITORY / "docs" / "figures"
+ALERTS = REPOSITORY / "deploy" / "prometheus" / "alerts.yml"
 MARKED = re.compile(r"<!-- figures: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
+MARKED_LISTS = re.compile(r"<!-- (metrics|alerts) -->\n(.*?)<!-- end -->", re.DOTALL)
 MARKED_STATES = re.compile(r"<!-- states: (\S+) -->\n(.*?)<!-- end -->", re.DOTALL)
 STATES: dict[str, tuple[type[StrEnum], Mapping[Any, set[Any]] | None]] = {
     "worker": (WorkerPhase, NEXT_PHASES),
@@ -140,6 +148,30 @@ def states(name: str) -> str:
     return "\n".join(lines)
 
 
+def metrics() -> str:
+    """The table of the metrics in Markdown: name, type, labels with their values, and meaning."""
+    lines = ["| metric | type | labels | meaning |", "|---|---|---|---|"]
+    for metric in METRICS:
+        labels = ", ".join(f"`{label}`" for label in metric.labels)
+        values = f": {', '.join(f'`{value}`' for value in metric.values)}" if metric.values else ""
+        lines.append(f"| `{metric.name}` | {metric.kind} | {labels}{values} | {metric.meaning} |")
+    return "\n".join(lines)
+
+
+def alerts() -> str:
+    """The table of the alerts in Markdown: name, severity, what it means, and what helps."""
+    lines = ["| alert | severity | what it means | what helps |", "|---|---|---|---|"]
+    for group in yaml.safe_load(ALERTS.read_text(encoding="utf-8"))["groups"]:
+        for rule in group["rules"]:
+            said = rule["annotations"]
+            cells = (f"`{rule['alert']}`", rule["labels"]["severity"], said["description"], said["remedy"])
+            lines.append(f"| {' | '.join(cells)} |")
+    return "\n".join(lines)
+
+
+LISTS = {"metrics": metrics, "alerts": alerts}
+
+
 def rendered(page: Path) -> str:
     """The page's text, every marked table as measurements and code say. FiguresError for a marker without an end."""
     text = page.read_text(encoding="utf-8")
@@ -147,6 +179,9 @@ def rendered(page: Path) -> str:
         if text.count(f"<!-- {what}: ") != len(marked.findall(text)):
             raise FiguresError(f"{page}: a marker of {what} has no end; close it with <!-- end -->")
     text = MARKED.sub(lambda mark: f"<!-- figures: {mark[1]} -->\n{table(mark[1], page)}\n<!-- end -->", text)
+    if sum(text.count(f"<!-- {name} -->") for name in LISTS) != len(MARKED_LISTS.findall(text)):
+        raise FiguresError(f"{page}: a marker of metrics or alerts has no end; close it with <!-- end -->")
+    text = MARKED_LISTS.sub(lambda mark: f"<!-- {mark[1]} -->\n{LISTS[mark[1]]()}\n<!-- end -->", text)
     return MARKED_STATES.sub(lambda mark: f"<!-- states: {mark[1]} -->\n{states(mark[1])}\n<!-- end -->", text)
 
 

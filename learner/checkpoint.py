@@ -8,7 +8,7 @@ from collections.abc import Mapping
 from t6gps.learner.algorithm import pairs
 from t6gps.learner.algorithm.pairs import Pairs
 from t6gps.learner.improvers.action_value import ActionValue
-from t6gps.learner.port import Arrays, LearnerState, Manifest
+from t6gps.learner.port import Arrays, LearnerState, Manifest, packed_policy
 from t6gps.learner.rows import AnyArray
 from t6gps.storage.errors import CheckpointError, RunError
 from t6gps.storage.records import PolicySnapshot
@@ -68,9 +68,9 @@ class Carried:
         Raises CheckpointError when entries are missing or the network has another shape than the present one.
         """
         try:
-            restored, earlier = _policy(manifest, arrays, "layer", manifest["version"]), None
+            restored, earlier = packed_policy(manifest, arrays), None
             if self._keeps_earlier and restored.version > 0:
-                earlier = _policy(manifest, arrays, "earlier_layer", restored.version - 1)
+                earlier = packed_policy(manifest, arrays, "earlier_layer", restored.version - 1)
             replayed = [
                 pairs.every(arrays[f"replay_{number}_observations"], arrays[f"replay_{number}_actions"])
                 for number in range(manifest["replays"])
@@ -95,11 +95,3 @@ def _arrays(snapshot: PolicySnapshot, name: str) -> Arrays:
     for number, (weight, bias) in enumerate(snapshot.layers):
         arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"] = weight, bias
     return arrays
-
-
-def _policy(manifest: Manifest, arrays: Mapping[str, AnyArray], name: str, version: int) -> PolicySnapshot:
-    """The policy of which `_arrays` has made these layers. KeyError when one is missing."""
-    layers = tuple(
-        (arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"]) for number in range(manifest["layers"])
-    )
-    return PolicySnapshot(version, layers, manifest["offset_m"], manifest["scale_m"])

@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Iterator, Mapping
 from typing import NamedTuple, Protocol, TypedDict
 
+import pyarrow as pa
+
 from t6gps.learner.rows import AnyArray
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import PolicySnapshot
@@ -33,11 +35,23 @@ class LearnerState(NamedTuple):
     arrays: Arrays
 
 
+def packed_policy(
+    manifest: Manifest, arrays: Mapping[str, AnyArray], name: str = "layer", version: int | None = None
+) -> PolicySnapshot:
+    """The policy in a learner's state: the newest, or one whose layers have another name. KeyError without them."""
+    layers = tuple(
+        (arrays[f"{name}_{number}_weight"], arrays[f"{name}_{number}_bias"]) for number in range(manifest["layers"])
+    )
+    number = manifest["version"] if version is None else version
+    return PolicySnapshot(number, layers, manifest["offset_m"], manifest["scale_m"])
+
+
 class Report(NamedTuple):
-    """The learner's columns of `iterations`, and the rows of `classes`, of the iteration just finished."""
+    """Of the iteration just finished: the learner's columns of `iterations`, the rows of `classes` and of `models`."""
 
     iteration: Row
     classes: list[Row]
+    models: pa.Table
 
 
 class LearnerPort(Protocol):

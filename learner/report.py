@@ -1,10 +1,11 @@
-"""What of an iteration goes into the tables `iterations` and `classes`."""
+"""What of an iteration goes into the tables `iterations`, `classes` and `models`."""
 
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.learner import cost
@@ -17,6 +18,7 @@ from t6gps.learner.exploration import Exploration
 from t6gps.learner.improvers.improver import Improved
 from t6gps.learner.port import Report, Row
 from t6gps.learner.rows import NONE, Floats, Ints, Rows, pieces, root_mean_square
+from t6gps.storage.schema import MODELS
 
 
 @dataclass(frozen=True)
@@ -61,11 +63,15 @@ def report(
     target_speed_m_per_s: float,
     vertical_weight: float,
 ) -> Report:
-    """The learner's columns of `iterations` and the rows of `classes`."""
+    """The learner's columns of `iterations`, the rows of `classes` and of `models`."""
     rows = results.segmented.rows
     cost_after = np.roll(cost.running_cost(rows.state, rows.target, target_speed_m_per_s, vertical_weight), -1)
     classes = _class_rows(results, cost_after)
-    return Report(_iteration_row(results, command_range_m), [{"iteration": iteration, **row} for row in classes])
+    return Report(
+        _iteration_row(results, command_range_m),
+        [{"iteration": iteration, **row} for row in classes],
+        _model_rows(results, iteration),
+    )
 
 
 def kl(rows: Rows, part: Ints, action_mean: Floats, explored: Exploration) -> Floats:
@@ -127,8 +133,8 @@ def _class_row(results: Iteration, cost_after: NDArray[np.floating], number: int
     change = results.improved.predicted_cost_change[sampled]
     return {
         "kind": key.kind,
-        "entry_edge": None if key.entry == NONE else key.entry,
-        "exit_edge": None if key.exit == NONE else key.exit,
+        "entry_edge": _edge(key.entry),
+        "exit_edge": _edge(key.exit),
         "truncated": key.truncated,
         "segments": len(members),
         "rows": int(lengths[members].sum()),
@@ -140,6 +146,60 @@ def _class_row(results: Iteration, cost_after: NDArray[np.floating], number: int
         "predicted_cost_change": _mean(change) if sampled.any() else None,
         "policy_kl": _mean(results.trained.kl[within]),
     }
+
+
+def _model_rows(results: Iteration, iteration: int) -> pa.Table:
+    """The rows of `models`."""
+    groups = dict(enumerate(results.segmented.groups))  # none where samples are not grouped by class
+    return pa.concat_tables(
+        [_models_of(number, groups.get(number), fit, iteration) for number, fit in results.fitted.fits.items()]
+    )
+
+
+def _models_of(number: int, group: SegmentGroup | None, fit: ClassModel, iteration: int) -> pa.Table:
+    """The rows of the models of one bin of samples."""
+    models_n = len(fit.models)
+    samples = np.bincount(fit.model, minlength=models_n)
+    residual = np.bincount(fit.model, fit.residual, models_n) / np.maximum(samples, 1)
+    shared: dict[str, int | None] = {"iteration": iteration, "bin": number, **_key(group)}
+    columns = {
+        **{name: [value] * models_n for name, value in shared.items()},
+        "step": np.repeat(np.arange(len(fit.modes)), fit.modes),
+        "mode": np.concatenate([np.arange(modes) for modes in fit.modes]),
+        "samples": samples,
+        "residual": pa.array(residual, mask=samples == 0),
+        "dynamics_matrix": _numbers(fit.models.F),
+        "dynamics_offset": _numbers(fit.models.f),
+        "policy_matrix": _numbers(fit.models.P),
+        "policy_offset": _numbers(fit.models.p),
+        "action_variance": _numbers(fit.models.variance),
+    }
+    return pa.table([pa.array(columns[field.name], field.type) for field in MODELS], schema=MODELS)
+
+
+def _key(group: SegmentGroup | None) -> dict[str, int | None]:
+    """Columns of a group's class, all None for a bin of other samples."""
+    if group is None:
+        return dict.fromkeys(("kind", "entry_edge", "exit_edge", "truncated", "pooled"))
+    kind, entry, exit_, truncated = group.key
+    return {
+        "kind": kind,
+        "entry_edge": _edge(entry),
+        "exit_edge": _edge(exit_),
+        "truncated": truncated,
+        "pooled": group.pooled,
+    }
+
+
+def _numbers(arrays: Floats | NDArray[np.float64]) -> pa.Array:
+    """A list of numbers for each of k arrays [k, ...]."""
+    flat = np.ascontiguousarray(arrays, dtype=np.float32).reshape(-1)
+    return pa.ListArray.from_arrays(np.arange(len(arrays) + 1, dtype=np.int32) * arrays[0].size, pa.array(flat))
+
+
+def _edge(number: int) -> int | None:
+    """The number of an edge, None where there is none."""
+    return None if number == NONE else number
 
 
 def _mean(values: NDArray[np.floating]) -> float:

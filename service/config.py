@@ -186,8 +186,15 @@ def check_keys(overrides: Sequence[str], command: str, allowed: tuple[str, ...],
 
 def differences(stored: Config, wanted: Config) -> list[str]:
     """Keys whose values differ, with both values; those of NO_EFFECT may differ."""
-    a, b = _flat(stored.model_dump()), _flat(wanted.model_dump())
-    return [f"{key} = {b[key]} (the run has {a[key]})" for key in a if a[key] != b[key] and key not in NO_EFFECT]
+    found = changed(stored, wanted)
+    before = _flat(stored.model_dump(mode="json"))
+    return [f"{key} = {value} (the run has {before[key]})" for key, value in found.items()]
+
+
+def changed(stored: Config, wanted: Config) -> dict[str, JsonValue]:
+    """Values of another configuration that differ, by dotted key; those of NO_EFFECT may differ."""
+    a, b = (_flat(config.model_dump(mode="json")) for config in (stored, wanted))
+    return {key: value for key, value in b.items() if a[key] != value and key not in NO_EFFECT}
 
 
 def assigned(override: str) -> tuple[str, JsonValue]:
@@ -260,8 +267,8 @@ def _nearest(name: str, names: Sequence[str]) -> str:
     return f" (did you mean {close[0]}?)" if close else ""
 
 
-def _flat(values: Mapping[str, object], prefix: str = "") -> dict[str, object]:
-    flat: dict[str, object] = {}
+def _flat(values: Mapping[str, JsonValue], prefix: str = "") -> dict[str, JsonValue]:
+    flat: dict[str, JsonValue] = {}
     for key, value in values.items():
         flat |= _flat(value, f"{prefix}{key}.") if isinstance(value, dict) else {prefix + key: value}
     return flat

@@ -76,10 +76,10 @@ def build() -> dict[str, str]:
     return {**versions(), "schema": str(SCHEMA_VERSION), **digests}
 
 
-def differences(found: Mapping[str, str], here: Mapping[str, str]) -> str:
-    """In what one `build` is another than the run's, with both values; empty where they are alike."""
+def differences(found: Mapping[str, str], here: Mapping[str, str], whose: str = "the run") -> str:
+    """In what one `build` is another than that of `whose`, with both values; empty where they are alike."""
     return ", ".join(
-        f"{name} {found.get(name, 'none')} (the run: {here.get(name, 'none')})"
+        f"{name} {found.get(name, 'none')} ({whose}: {here.get(name, 'none')})"
         for name in {**here, **found}
         if found.get(name) != here.get(name)
     )

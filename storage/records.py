@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -74,3 +75,19 @@ class Episode:
     def nbytes(self) -> int:
         """Memory that it takes."""
         return int(self.frames.nbytes if self.packed is None else self.packed.size)
+
+
+@dataclass(frozen=True)
+class Learned:
+    """What the learner's work on an iteration adds to the tables.
+
+    iteration   the row of `iterations`
+    classes     rows of `classes`
+    models      rows of `models`
+    policies    those that are new
+    """
+
+    iteration: Mapping[str, object]
+    classes: Sequence[Mapping[str, object]]
+    models: pa.Table
+    policies: Sequence[PolicySnapshot]

@@ -12,7 +12,7 @@ from pathlib import Path
 
 import pyarrow as pa
 
-from t6gps.storage import durable, ipc, schema
+from t6gps.storage import durable, fields, ipc, schema
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode
 
@@ -27,10 +27,10 @@ def checked(episode: Episode, iteration: int) -> Episode:
     """
     if episode.summary.num_rows != 1:
         raise DataError(f"the summary of an episode must have one row, found {episode.summary.num_rows}")
-    schema.check(episode.summary, schema.EPISODES, "summary of an episode")
+    fields.check(episode.summary, schema.EPISODES, "summary of an episode")
     summary = episode.summary.to_pylist()[0]
     where = f"episode {summary['episode_id']}"
-    schema.check(episode.frames, schema.FRAMES, f"frames of {where}")
+    fields.check(episode.frames, schema.FRAMES, f"frames of {where}")
     if summary["iteration"] != iteration:
         raise DataError(f"{where}: belongs to iteration {summary['iteration']}, expected {iteration}")
     if episode.frames.num_rows != summary["steps"] + 1:
@@ -82,9 +82,13 @@ class Spool:
         """Numbers of the whole episodes, of which none is held."""
         return {episode.episode_id for episode in self._whole()}
 
+    def files(self) -> list[Path]:
+        """The files of all episodes in ascending order, torn ones among them."""
+        return sorted(self._folder.glob("episode-*.arrow"))
+
     def _whole(self) -> Iterator[Episode]:
         self.torn = 0
-        for path in sorted(self._folder.glob("episode-*.arrow")):
+        for path in self.files():
             try:
                 episode = checked(read(path), self.iteration)
             except (pa.ArrowException, OSError, DataError) as error:

@@ -15,7 +15,7 @@ from tiny_run import Trained
 
 from t6gps.__main__ import use_one_thread
 from t6gps.service import threads
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.records import Episode
 
 threads.limit()  # of the libraries that are loaded
@@ -34,7 +34,7 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
 
 def _column(field: pa.Field, rows: int, rng: np.random.Generator) -> pa.Array:
     """Random values of a field; any bit pattern of a finite float may appear, also -0.0 and denormals."""
-    length = schema.vector_length(field)
+    length = fields.vector_length(field)
     size = rows * (length or 1)
     leaf = field.type.value_type if length else field.type
     if pa.types.is_floating(leaf):
@@ -77,8 +77,8 @@ def _make_episode(episode_id: int, iteration: int, steps: int = 5, rng: np.rando
     frames = _table(schema.FRAMES, steps + 1, {**identity, "step": np.arange(steps + 1)}, rng)
     summary = _table(schema.EPISODES, 1, {**identity, "steps": steps, "index": episode_id % 100}, rng)
     return Episode(
-        schema.check(frames, schema.FRAMES, "synthetic frames"),
-        schema.check(summary, schema.EPISODES, "synthetic summary"),
+        fields.check(frames, schema.FRAMES, "synthetic frames"),
+        fields.check(summary, schema.EPISODES, "synthetic summary"),
     )
 
 

@@ -17,9 +17,10 @@ from t6gps.service.remote.client import Client
 from t6gps.service.remote.messages import Scope
 from t6gps.service.server import serving
 from t6gps.service.server.guard import Limits
-from t6gps.storage import schema, tables
+from t6gps.storage import schema
 from t6gps.storage.catalog import Run
-from t6gps.storage.records import Episode
+from t6gps.storage.delta import iterations
+from t6gps.storage.records import Episode, Learned
 
 PATIENT = Limits(requests=(1e6, 10**6), failures=(1e6, 10**6))
 
@@ -58,7 +59,8 @@ def commit(run: Run, iteration: int, make_episode: Callable[..., Episode]) -> No
     """Commit an iteration of one synthetic episode."""
     row: dict[str, object] = dict.fromkeys(schema.ITERATIONS.names, 0)
     row |= {"iteration": iteration, "cost": 0.5 + iteration}
-    tables.commit_iteration(run, iteration, iter([make_episode(iteration, iteration)]), row, [])
+    learned = Learned(row, [], schema.MODELS.empty_table(), [])
+    iterations.commit(run, iteration, iter([make_episode(iteration, iteration)]), learned)
 
 
 @contextmanager

@@ -1,7 +1,8 @@
 """Digests of everything that a run's data hold: `python tests/run_digest.py RUN_FOLDER ...`.
 
 Runs with the same digests hold the same bytes: rows of the tables, whatever their order, arrays of the newest
-checkpoint, and the evaluation. Durations do not count; they alone differ between two runs of one configuration.
+checkpoint, and evaluations. Durations do not count, nor when and by which commit an evaluation was made: they alone
+differ between two runs of one configuration.
 """
 
 from __future__ import annotations
@@ -22,22 +23,31 @@ ORDER = {
     "episodes": ("episode_id",),
     "iterations": ("iteration",),
     "classes": ("iteration", "kind", "entry_edge", "exit_edge", "truncated", "pooled"),
+    "models": ("iteration", "bin", "step", "mode"),
+    "policies": ("version",),
+    "evaluations": ("evaluation_id",),
+    "evaluation_episodes": ("evaluation_id", "episode_id"),
+    "evaluation_frames": ("evaluation_id", "episode_id", "step"),
 }
 """Columns that say in which order the rows of a table count."""
+MADE = {("evaluations", "commit"), ("evaluations", "made_at")}
+"""Columns that say what made the data."""
 
 
 def digests(folder: Path) -> dict[str, str]:
-    """SHA-256 of each part of the run in `folder`: its tables, `checkpoint`, and `evaluation` where it has one."""
+    """SHA-256 of each part of the run in `folder`: its tables, `checkpoint`, and `evaluation` where it has them."""
     run = Run(folder)
-    parts = {name: _sum(_table_bytes(run, name)) for name in schema.TABLES}
+    evaluated = tables.read(run, "evaluations").num_rows > 0
+    names = schema.TABLES if evaluated else schema.OF_ITERATIONS
+    parts = {name: _sum(_table_bytes(run, name)) for name in names}
     latest = checkpoint.load_latest(run.checkpoints)
     if latest is not None:
         iteration, _, arrays = latest
         named = (part for name in sorted(arrays) for part in (name.encode(), arrays[name].tobytes()))
         parts["checkpoint"] = _sum([str(iteration).encode(), *named])
-    evaluated = folder / "evaluation.json"
-    if evaluated.exists():
-        parts["evaluation"] = _sum([evaluated.read_bytes()])
+    file = folder / "evaluation.json"
+    if file.exists():
+        parts["evaluation"] = _sum([file.read_bytes()])
     return parts
 
 
@@ -57,7 +67,8 @@ def column_bytes(column: pa.ChunkedArray) -> Iterator[bytes]:
 def _table_bytes(run: Run, name: str) -> Iterator[bytes]:
     rows = tables.read(run, name).sort_by([(key, "ascending") for key in ORDER[name]])
     for column in rows.column_names:
-        if not (name == "iterations" and column.endswith("_s") and not column.endswith("_per_s")):
+        duration = name == "iterations" and column.endswith("_s") and not column.endswith("_per_s")
+        if not duration and (name, column) not in MADE:
             yield column.encode()
             yield from column_bytes(rows.column(column))
 

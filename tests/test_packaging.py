@@ -60,7 +60,8 @@ def test_the_wheel_holds_every_module_preset_script_and_the_plugin(wheel: Path) 
             assert f"{package.replace('.', '/')}/{module.name}" in names
     for preset in (REPOSITORY / "deploy" / "presets").glob("*.toml"):
         assert f"t6gps/deploy/presets/{preset.name}" in names
-    for script in ("launch/train.sh", "slurm/train.sbatch"):
+    shipped = ("launch/train.sh", "ray/cluster.yaml", "slurm/train.sbatch", "grafana/t6gps.json")
+    for script in (*shipped, "prometheus/prometheus.yml", "prometheus/alerts.yml"):
         assert f"t6gps/deploy/{script}" in names
     for module in SETUPTOOLS["ext-modules"]:
         assert f"{module['name'].replace('.', '/')}{sysconfig.get_config_var('EXT_SUFFIX')}" in names

@@ -17,7 +17,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import ConfigError, PhysicsError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.physics.bullet import pybullet
@@ -163,7 +163,7 @@ ORDERS: dict[str, Callable[[EpisodePlan, PolicySnapshot], Episode]] = {
 def _table(definition: pa.Schema, rows: int, known: Known, rng: np.random.Generator) -> pa.Table:
     columns = []
     for field in definition:
-        length = schema.vector_length(field)
+        length = fields.vector_length(field)
         if field.name in known:
             column = pa.array(np.broadcast_to(known[field.name], rows), field.type)
         elif length is not None:

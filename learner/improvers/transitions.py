@@ -21,13 +21,13 @@ from t6gps.learner import policy
 from t6gps.learner.algorithm.features import acting, spread, vectors
 from t6gps.learner.episodes import Episodes
 from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, pieces
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import RunError
 
 STATE = ("observation", "com_velocity", "node_velocities")
 """Columns of `frames` that make up s."""
 OBSERVATION_N, *_, ACTION_N = LENGTHS = [
-    schema.vector_length(schema.FRAMES.field(name)) or 0 for name in (*STATE, "action")
+    fields.vector_length(schema.FRAMES.field(name)) or 0 for name in (*STATE, "action")
 ]
 INPUTS_N = sum(LENGTHS)
 """Entries of [s; e]."""

@@ -3,17 +3,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import cast, final
+from typing import final
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
-from t6gps.learner.port import Manifest
-from t6gps.service import config as configuration
-from t6gps.service.execution.wiring import new_learner
-from t6gps.storage import checkpoint
-from t6gps.storage.catalog import Run as Folder
-from t6gps.storage.errors import DataError, RunError
+from t6gps.storage.errors import DataError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers.episode import policy as acting
@@ -50,20 +45,3 @@ class Policy:
                 f"{int(np.isfinite(values).sum())} of them finite; give one row at a time"
             )
         return acting.ready(self.snapshot)(values)
-
-
-def load(run: Folder, version: int | None) -> Policy:
-    """The policy of a checkpoint, the newest by default. RunError naming the versions that are kept."""
-    if version is None:
-        latest = checkpoint.load_latest(run.checkpoints)
-        if latest is None:
-            raise RunError(f"run {run.name} has no checkpoint yet; let it finish an iteration")
-    else:
-        kept = checkpoint.kept(run.checkpoints)
-        if version not in kept:
-            versions = ", ".join(map(str, sorted(kept))) or "none yet"
-            raise RunError(f"run {run.name} keeps no policy of version {version!r}; kept: {versions}")
-        latest = checkpoint.load(kept[version])
-    learner = new_learner(configuration.kept(run))
-    learner.restore(cast(Manifest, latest[1]), latest[2])
-    return Policy(learner.policy())

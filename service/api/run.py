@@ -11,13 +11,12 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from t6gps.service import config as configuration
-from t6gps.service.api import policy
 from t6gps.service.api.policy import Policy
 from t6gps.service.config import Config
 from t6gps.service.steering import events, requests, status
 from t6gps.service.steering.events import Event
 from t6gps.service.steering.status import Status
-from t6gps.service.training import evaluation
+from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import catalog, tables
 from t6gps.storage.sql.query import query
@@ -49,7 +48,7 @@ class Run:
         return evaluation.kept(self._folder)
 
     def query(self, sql: str) -> pa.Table:
-        """The result of one SELECT over the tables frames, episodes, iterations and classes (docs/data.md).
+        """The result of one SELECT over its tables (docs/data.md).
 
         Only committed iterations are seen. QueryError for SQL that is refused, wrong, or takes too much.
         """
@@ -67,11 +66,11 @@ class Run:
 
     def episode(self, number: int) -> pa.Table:
         """The frames of one episode, T + 1 rows. DataError naming the episodes that exist."""
-        return tables.episode_frames(self._folder, number)
+        return tables.episode(self._folder, number).frames
 
     def policy(self, version: int | None = None) -> Policy:
         """The policy of a version that is kept, the newest by default. RunError naming the versions that are."""
-        return policy.load(self._folder, version)
+        return Policy(policies.load(self._folder, version))
 
     def status(self) -> Status:
         """How the run is: its state, workers, and who waits for whom. RunError when it never had workers."""

@@ -10,14 +10,13 @@ from __future__ import annotations
 import json
 import logging
 from collections.abc import Callable, Mapping, Sequence
-from contextlib import closing
 from dataclasses import dataclass
 from os import PathLike, fspath
 from pathlib import Path
 
 from t6gps.service import config as configuration
 from t6gps.service.api.run import Run
-from t6gps.service.training import evaluation, session
+from t6gps.service.training import session
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
@@ -100,14 +99,18 @@ def evaluate(
     episodes: int = 40,
     seed: int = 1,
     terrain_seed: int | None = None,
+    version: int | None = None,
+    keep: bool = True,
     settings: Mapping[str, Setting] | None = None,
     workers: int | None = None,
     serial: bool = False,
     progress: Callable[[Progress], object] | None = None,
 ) -> Evaluation:
-    """Evaluate a run's newest policy without noise; nothing is stored.
+    """Evaluate a policy of a run without noise.
 
     episodes       at least two
+    version        of the policy, the newest by default
+    keep           the episodes, in the run's tables `evaluations`, `evaluation_episodes` and `evaluation_frames`
     seed           of starts, waypoints and ground; no training episode shares its random numbers
     terrain_seed   of the ground alone
     settings       another world, such as {"terrain.difficulty": 0.5}
@@ -120,8 +123,9 @@ def evaluate(
             raise ConfigError(f"evaluate takes a whole {what} >= {least}, found {value!r}; give another number")
     folder = catalog.Run(run.path)
     config = session.evaluation_config(folder, _overrides(settings, workers), _log.warning)
-    with closing(session.restored(config, folder, serial)) as executor:
-        return evaluation.evaluate(config, executor, episodes, seed, terrain_seed, _Teller(progress))
+    asked = session.Asked(episodes, seed, terrain_seed, version, keep)
+    result, _ = session.evaluate(folder, config, asked, serial, session.Engine.BULLET, _Teller(progress))
+    return result
 
 
 def _overrides(settings: Mapping[str, Setting] | None, workers: int | None) -> list[str]:

@@ -18,6 +18,7 @@ from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
+from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.storage.sql.query import Head
 
 if TYPE_CHECKING:
@@ -49,7 +50,9 @@ class Door(Protocol):
 
     def table(self, name: str, table: str) -> pa.Table: ...
 
-    def episode(self, name: str, number: int) -> tuple[pa.Table, dict[str, object]]: ...
+    def episode(self, name: str, number: int, evaluation: int | None) -> Episode: ...
+
+    def policy(self, name: str, version: int | None) -> PolicySnapshot: ...
 
     def evaluation(self, name: str) -> Evaluation | None: ...
 

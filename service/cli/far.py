@@ -16,10 +16,12 @@ from t6gps.service.remote.client import Client
 from t6gps.service.remote.source import FarSource
 from t6gps.service.steering.events import Event
 from t6gps.service.steering.status import Status
+from t6gps.service.training import policies
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
+from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.storage.sql.query import Head
 
 
@@ -70,10 +72,13 @@ class Far:
     def table(self, name: str, table: str) -> pa.Table:
         return self.client.table(name, table)
 
-    def episode(self, name: str, number: int) -> tuple[pa.Table, dict[str, object]]:
+    def episode(self, name: str, number: int, evaluation: int | None) -> Episode:
         frames = self.client.episode(name, number)
-        row = self.client.query(name, f"SELECT * FROM episodes WHERE episode_id = {number}")
-        return frames, row.to_pylist()[0]
+        return Episode(frames, self.client.query(name, f"SELECT * FROM episodes WHERE episode_id = {number}"))
+
+    def policy(self, name: str, version: int | None) -> PolicySnapshot:
+        chosen = policies.chosen_of(name, self.client.versions(name), version)
+        return self.client.policy(name, chosen).snapshot
 
     def evaluation(self, name: str) -> Evaluation | None:
         return self.client.evaluation(name)

@@ -9,7 +9,6 @@ from pathlib import Path
 from typing import BinaryIO, final
 
 import pyarrow as pa
-import pyarrow.compute as pc
 
 from t6gps.service.launch import control, launchers
 from t6gps.service.launch import job as records
@@ -18,12 +17,13 @@ from t6gps.service.launch.fetch import FolderSource, Source
 from t6gps.service.steering import events, requests
 from t6gps.service.steering.events import Event
 from t6gps.service.steering.status import Status
-from t6gps.service.training import evaluation, origin, summary
+from t6gps.service.training import evaluation, origin, policies, summary
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
+from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.storage.sql import query
 from t6gps.storage.sql.query import Head
 
@@ -87,11 +87,13 @@ class Here:
         tables.files(run)
         return tables.read(run, table)
 
-    def episode(self, name: str, number: int) -> tuple[pa.Table, dict[str, object]]:
-        """The frames of an episode, and its row of the table `episodes`."""
-        run = self._run(name)
-        frames = tables.episode_frames(run, number)
-        return frames, tables.read(run, "episodes", filter=pc.field("episode_id") == number).to_pylist()[0]
+    def episode(self, name: str, number: int, evaluation: int | None) -> Episode:
+        """An episode of training, or of an evaluation."""
+        return tables.episode(self._run(name), number, evaluation)
+
+    def policy(self, name: str, version: int | None) -> PolicySnapshot:
+        """The policy of a version, the newest by default."""
+        return policies.load(self._run(name), version)
 
     def evaluation(self, name: str) -> Evaluation | None:
         """What the last policy did without noise; None before the training has ended."""

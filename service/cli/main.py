@@ -7,16 +7,16 @@ matplotlib) is imported by the commands that need it, so that the others answer 
 
 from __future__ import annotations
 
+import logging
 import shlex
 import sys
 from collections.abc import Sequence
-from contextlib import closing
 from pathlib import Path
 from typing import Annotated, NoReturn
 
 import typer
 
-from t6gps.service import advice
+from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
 from t6gps.service.cli import doctor, door, launching, live, serving, stored
@@ -32,9 +32,10 @@ from t6gps.service.cli.options import (
     Workers,
     with_workers,
 )
+from t6gps.service.logs import Role, Speaker
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
-from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training import origin, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
 from t6gps.storage.catalog import Run
@@ -42,13 +43,15 @@ from t6gps.storage.errors import T6GpsError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
-EXIT_BAD_INPUT, EXIT_INTERRUPTED = 2, 130
+EXIT_MISTAKE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
+_log = logging.getLogger(__name__)
 
 
 def main(arguments: Sequence[str] | None = None) -> None:
     """Run the command; `t6gps.__main__` has prepared the process, whose arguments are taken where none are given."""
     try:
         try:
+            logs.begin(Speaker(logs.chosen()))
             app(arguments)
         finally:
             sys.stdout.flush()  # a full disk is told of below
@@ -58,9 +61,14 @@ def main(arguments: Sequence[str] | None = None) -> None:
         message = advice.sentence(error)
     except KeyboardInterrupt:  # before or after the command itself
         sys.exit(EXIT_INTERRUPTED)
+    except Exception:  # a mistake of ours
+        if not logs.as_json():
+            raise
+        _log.critical("the command has made a mistake; report it", exc_info=True)
+        sys.exit(EXIT_MISTAKE)
     else:
         return
-    terminal.say(f"error: {message}", style="red")
+    terminal.say(message, logging.ERROR)
     sys.exit(EXIT_BAD_INPUT)
 
 
@@ -83,7 +91,9 @@ def train(
         serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
         return
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
+    logs.become(Role.SUPERVISOR, run_name)
     run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
+    logs.become(Role.SUPERVISOR, run.name)
     try:
         with terminal.ProgressDisplay(config.run.iterations) as display:
             result = session.complete(config, run, serial, display)
@@ -140,24 +150,30 @@ def evaluate(
     episodes: Annotated[int, typer.Option(min=2, help="Noise-free episodes.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and waypoints; never one of training.")] = 1,
     terrain_seed: Annotated[int | None, typer.Option(min=0, help="Seed of the ground alone.")] = None,
+    version: Annotated[
+        int | None, typer.Option("--policy", min=0, help="Version of the policy; by default the newest.")
+    ] = None,
+    no_keep: Annotated[bool, typer.Option("--no-keep", help="Leave the run's tables as they are.")] = False,
     overrides: Overrides = None,
     workers: Workers = None,
     serial: Serial = False,
     engine: Annotated[Engine, typer.Option(help="mujoco cross-checks, as with --serial.")] = Engine.BULLET,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's newest policy without noise on unseen seeds."""
+    """Evaluate a run's policy without noise on unseen seeds, and keep the episodes, but not for a server's run."""
+    logs.become(Role.SUPERVISOR, run_name)
     with door.opened(root, server) as there, there.at_hand(run_name) as run:
         config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
-        with (
-            closing(session.restored(config, run, serial, engine)) as executor,
-            terminal.ProgressDisplay(config.run.iterations) as display,
-        ):
-            result = evaluation.evaluate(config, executor, episodes, seed, terrain_seed, display)
+        policy = there.policy(run_name, version)
+        asked = session.Asked(episodes, seed, terrain_seed, policy.version, keep=server is None and not no_keep)
+        with terminal.ProgressDisplay(config.run.iterations) as display:
+            result, number = session.evaluate(run, config, asked, serial, engine, display, policy)
     if as_json:
         typer.echo(result.to_json())
     else:
         terminal.print_evaluation(result)
+    if number is not None:
+        terminal.say(f"kept as evaluation {number}: see the table evaluations, or t6gps render with --evaluation")
 
 
 @app.command()

@@ -10,8 +10,10 @@ from typing import Annotated
 import typer
 
 from t6gps.service import config as configuration
+from t6gps.service import logs
 from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, Server
+from t6gps.service.logs import Role
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
@@ -50,6 +52,7 @@ def serve(
         from t6gps.service.server import serving
     except ModuleNotFoundError as error:
         raise ConfigError(f"t6gps serve needs {error.name}; install it with: pip install 't6gps[server]'") from None
+    logs.become(Role.SERVER)
     address = serving.Address(host=host, port=port, names=names or (), cert=cert, key=key)
     try:
         serving.serve(root, address, terminal.say)

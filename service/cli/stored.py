@@ -15,7 +15,7 @@ import typer
 from t6gps.service import config as configuration
 from t6gps.service.cli import door
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root, RunName, Server
-from t6gps.service.training import origin, session
+from t6gps.service.training import evaluation_records, origin, session
 from t6gps.service.training.summary import RunSummary
 from t6gps.service.views import terminal
 from t6gps.service.views.diagnosis import diagnose
@@ -105,6 +105,9 @@ def render(
     out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
     root: Root = DEFAULT_ROOT,
     server: Server = None,
+    evaluation_id: Annotated[
+        int | None, typer.Option("--evaluation", min=0, help="Evaluation that the episode is of.")
+    ] = None,
     step: Annotated[int | None, typer.Option(min=0, help="Control step of a still.")] = None,
     strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
 ) -> None:
@@ -113,14 +116,17 @@ def render(
     from t6gps.workers.pictures import render as rendering
     from t6gps.workers.pictures.scene import Sizes
 
+    if server is not None and evaluation_id is not None:
+        raise ConfigError("--evaluation draws from a run of this machine; bring it here with t6gps fetch")
     with door.opened(root, server) as there, there.at_hand(run_name) as run:
-        frames, row = there.episode(run_name, episode)
+        config = origin.configured(run) if evaluation_id is None else evaluation_records.world(run, evaluation_id)
+        stored = there.episode(run_name, episode, evaluation_id)
+        row = stored.summary.to_pylist()[0]
         session.tell_changes(run, terminal.warn)
-        config = origin.configured(run)
-        terrain = ground(config.terrain, int(str(row["terrain_seed"])), float(str(row["terrain_difficulty"])))
+        terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
         sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
         with terminal.task("rendering") as progress:
-            rendering.render(frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
+            rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)
 
 

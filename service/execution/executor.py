@@ -92,8 +92,8 @@ class Executor(ABC):
         """Start another learner in the place of one that died; it knows nothing."""
 
     @abstractmethod
-    def tend(self) -> None:
-        """Let the workers be looked after, where whoever calls is at other work for long."""
+    def tend(self, phase: str | None = None) -> None:
+        """Let the workers be looked after, where whoever calls is at other work for long: `phase`, for the status."""
 
     @abstractmethod
     def close(self, outcome: RunState = RunState.STOPPING) -> None:
@@ -110,7 +110,12 @@ class Executor(ABC):
         """Keep what is needed to find out why the episode fails."""
         failures = self.ledger.failures[plan.episode_id]
         _log.warning(
-            "%s %d is quarantined after %d failures: %s", self._purpose, plan.episode_id, len(failures), failures[-1]
+            "%s %d is quarantined after %d failures: %s",
+            self._purpose,
+            plan.episode_id,
+            len(failures),
+            failures[-1],
+            extra={"episode": plan.episode_id},
         )
         if self.run is not None:
             snapshot = self._snapshots[plan.policy_version]

@@ -109,7 +109,7 @@ class RayExecutor(Executor):
         self.learner.add_spooled(files)
 
     def learn(self, phase: Phase) -> Progress:
-        self.pool.phase = phase.name
+        self.pool.phases.enter(phase.name)
         return self.learner.learn(phase)
 
     def replace_learner(self) -> None:
@@ -141,8 +141,10 @@ class RayExecutor(Executor):
             self.pool.wait("the run", "the learner", False)
         self.tend()
 
-    def tend(self) -> None:
+    def tend(self, phase: str | None = None) -> None:
         """Let the pool work, but not all the time, and keep what was sampled ahead."""
+        if phase is not None:
+            self.pool.phases.enter(phase)
         if time.monotonic() - self.pool.ticked_s < TICK_S:
             return
         self.pool.tick()

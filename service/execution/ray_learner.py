@@ -21,8 +21,9 @@ import ray
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report
 from t6gps.learner.rows import AnyArray
-from t6gps.service import provenance, threads
+from t6gps.service import logs, provenance, threads
 from t6gps.service.config import Config
+from t6gps.service.logs import Role, Speaker
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.pool import TICK_S
 from t6gps.service.ray_backend import processes, pulse
@@ -45,7 +46,8 @@ EPISODES_UNDER_WAY_N = 32
 class LearnerActor:
     """The learner in a process of its own."""
 
-    def __init__(self, config: Config) -> None:
+    def __init__(self, speaker: Speaker, config: Config) -> None:
+        logs.begin(speaker)
         self._pulse = pulse.start()
         from t6gps.service.execution.wiring import new_learner  # it loads torch, which the supervisor does without
 
@@ -101,7 +103,7 @@ class RayLearner:
     """
 
     def __init__(self, config: Config, node: str, timings: Timings, until_done: Callable[[Reference], None]) -> None:
-        self.actor = start_actor(LearnerActor, config, where=node)
+        self.actor = start_actor(LearnerActor, logs.other(Role.LEARNER), config, where=node)
         self._until_done, self._timings = until_done, timings
         self._started_s = time.monotonic()
         self._asked: Future[Pulse] = self.actor.pulse.remote().future()
@@ -219,8 +221,10 @@ def as_at_home(function: Callable[[Job], Result], build: Mapping[str, str]) -> C
     RunError naming the node and what is installed there otherwise.
     """
 
+    speaker = logs.speaker()
+
     def limited(job: Job) -> Result:
-        if others := provenance.differences(_prepared_once(), build):
+        if others := provenance.differences(_prepared_once(speaker), build):
             raise RunError(
                 f"node {socket.gethostname()} has another installation than the run: {others}; install the same on "
                 "every node, then resume with --resume"
@@ -231,8 +235,9 @@ def as_at_home(function: Callable[[Job], Result], build: Mapping[str, str]) -> C
 
 
 @cache
-def _prepared_once() -> Mapping[str, str]:
+def _prepared_once(speaker: Speaker) -> Mapping[str, str]:
     """Set what holds as long as the process lives, and look at what does; both take some milliseconds."""
+    logs.begin(speaker)
     threads.limit()
     return provenance.build()
 

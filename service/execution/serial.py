@@ -9,10 +9,11 @@ from pathlib import Path
 from t6gps.learner.learner import Learner
 from t6gps.learner.phases import Phase
 from t6gps.learner.port import Progress
-from t6gps.service import threads
+from t6gps.service import logs, threads
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor, Keep, Purpose
 from t6gps.service.execution.wiring import new_learner
+from t6gps.service.logs import Role
 from t6gps.service.pool.attempt import Failure, attempt
 from t6gps.service.pool.state import RunState
 from t6gps.storage import spool
@@ -58,7 +59,8 @@ class SerialExecutor(Executor):
     ) -> None:
         self.ledger.open(plans, self._open(plans, snapshot, purpose))
         while (plan := self.ledger.lease(0, 0)) is not None:
-            result = attempt(self._worker, plan, snapshot)
+            with logs.speaking(logs.other(Role.WORKER, slot=0, episode=plan.episode_id)):
+                result = attempt(self._worker, plan, snapshot)
             if isinstance(result, Failure):
                 if self.ledger.fail(plan, result):
                     self._quarantine(plan)
@@ -85,7 +87,7 @@ class SerialExecutor(Executor):
     def replace_learner(self) -> None:
         self._learner = new_learner(self.config)
 
-    def tend(self) -> None:
+    def tend(self, phase: str | None = None) -> None:
         """Nothing runs beside the caller here."""
 
     def close(self, outcome: RunState = RunState.STOPPING) -> None:

@@ -56,11 +56,10 @@ class FolderSource:
         return {str(name): described(path) for name, path in names.items() if not name.parts[0].startswith(".")}
 
     def essentials(self) -> dict[str, File]:
-        """Those that a policy acts with: configuration, origin, ground and newest checkpoint; also of a run at work."""
+        """Those that say in which world a policy acts: configuration, origin and ground; also of a run at work."""
         run = self.run
-        newest = sorted(run.checkpoints.glob("iteration-*"))[-1:]
-        folders = [path for folder in (run.ground, *newest) if folder.is_dir() for path in sorted(folder.iterdir())]
-        paths = [path for path in (run.config_path, run.path / "origin.json", *folders) if path.is_file()]
+        ground = sorted(run.ground.iterdir()) if run.ground.is_dir() else []
+        paths = [path for path in (run.config_path, run.path / "origin.json", *ground) if path.is_file()]
         return {str(path.relative_to(run.path)): described(path) for path in paths}
 
     def pieces(self, path: str, offset: int) -> Iterator[bytes]:

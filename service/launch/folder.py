@@ -98,7 +98,7 @@ def prepared(config: Config, folder: Folder) -> Iterator[None]:
     try:
         folder.path.parent.mkdir(parents=True, exist_ok=True)
         with durable.draft(folder.path) as draft:
-            _write(config, folder, draft)
+            write(config, folder, draft)
             durable.sync_tree(draft)
             if before.exists():  # of a submission that was cut off
                 durable.discard(before)
@@ -121,8 +121,8 @@ def prepared(config: Config, folder: Folder) -> Iterator[None]:
     shutil.rmtree(before, ignore_errors=True)
 
 
-def _write(config: Config, folder: Folder, draft: Path) -> None:
-    """Write the contents of a job's folder; its ground will lie in it."""
+def write(config: Config, folder: Folder, draft: Path) -> None:
+    """Write what a job's folder shall hold into an empty folder `draft`. TerrainError for ground that is missing."""
     file = config.terrain.file
     if file is not None:
         copy = folder.path / "ground" / Path(file).name

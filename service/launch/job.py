@@ -14,6 +14,7 @@ from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
+from t6gps.service import logs
 from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.target import Kind
 from t6gps.storage import catalog, durable
@@ -63,6 +64,8 @@ class Job(BaseModel):
 def outcome(folder: Folder) -> tuple[JobState, str]:
     """How a job ended that is no longer there, and what its log said last."""
     code = folder.exit_code
+    if code is None and not folder.log.exists():
+        return JobState.FAILED, f"ended without a word or a log; let its nodes share the root {folder.root}"
     if code is None:
         return JobState.FAILED, f"ended without a word, killed or lost; see {folder.log}, resume with --resume"
     state = OUTCOMES.get(code, JobState.FAILED)
@@ -75,7 +78,7 @@ def last_words(folder: Folder) -> str:
         lines = folder.log.read_text(errors="replace").split("\n")
     except OSError:
         return f"it has no log {folder.log}"
-    return next((line.strip() for line in reversed(lines) if line.strip()), "its log is empty")
+    return next((logs.said(line.strip()) for line in reversed(lines) if line.strip()), "its log is empty")
 
 
 def state_folder() -> Path:

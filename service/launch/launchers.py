@@ -7,12 +7,18 @@ from t6gps.service.launch.job import Job
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.local import LocalLauncher
 from t6gps.service.launch.slurm import SlurmLauncher
-from t6gps.service.launch.target import Slurm, Target
+from t6gps.service.launch.target import Ray, Slurm, Target
 
 
 def of(target: Target) -> Launcher:
     """The launcher of a target."""
-    return SlurmLauncher(target) if isinstance(target, Slurm) else LocalLauncher()
+    if isinstance(target, Slurm):
+        return SlurmLauncher(target)
+    if isinstance(target, Ray):
+        from t6gps.service.launch.ray_jobs import RayLauncher  # it loads Ray
+
+        return RayLauncher(target)
+    return LocalLauncher()
 
 
 def serving(job: Job) -> Launcher:

@@ -50,8 +50,18 @@ class Slurm(Settings):
     )
 
 
-Target = Local | Slurm
-TARGETS: dict[Kind, type[Local] | type[Slurm]] = {Kind.LOCAL: Local, Kind.SLURM: Slurm}
+class Ray(Settings):
+    """A cluster of Ray that is up, by its Jobs API. Its token comes from the environment, as for Ray itself."""
+
+    address: str = Field("http://127.0.0.1:8265", pattern=r"^https?://[^/\s]+$", description="http://HEAD:8265")
+    root: str | None = Field(
+        None, pattern=r"^/", description="folder of the runs on the cluster, where this machine does not see it"
+    )
+    bin: str | None = Field(None, pattern=r"^/", description="folder of the programs t6gps and python on the nodes")
+
+
+Target = Local | Ray | Slurm
+TARGETS: dict[Kind, type[Local] | type[Ray] | type[Slurm]] = {Kind.LOCAL: Local, Kind.RAY: Ray, Kind.SLURM: Slurm}
 """What is known of each kind; a kind that is not here cannot be launched on yet."""
 
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import hashlib
+import logging
 import traceback
 from dataclasses import dataclass, field
 from enum import StrEnum
@@ -11,6 +12,8 @@ from typing import Any, Protocol
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.storage.spool import checked
+
+_log = logging.getLogger(__name__)
 
 
 class FailureKind(StrEnum):
@@ -77,7 +80,9 @@ def attempt(worker: Runner, plan: EpisodePlan, snapshot: PolicySnapshot) -> Epis
     except Exception as error:  # whatever a simulator raises, the run continues
         step, states = worker.position()
         trace = "".join(traceback.format_exception(error))
-        return Failure(FailureKind.RAISED, type(error).__name__, str(error), plan.seed, step, trace, states)
+        failure = Failure(FailureKind.RAISED, type(error).__name__, str(error), plan.seed, step, trace, states)
+        _log.error("an attempt at episode %d has failed: %s", plan.episode_id, failure)
+        return failure
     return episode
 
 

@@ -3,23 +3,46 @@
 from __future__ import annotations
 
 from abc import ABC, abstractmethod
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 
 from t6gps.service.pool.messages import Instruction, Observation
 from t6gps.service.pool.state import PoolState
 
 
+class Phases:
+    """What the run does at present, and how long it has done each of what it did (s).
+
+    at   the present phase: starting, sampling, a phase of the learner, or commit
+    """
+
+    def __init__(self, clock: Callable[[], float]) -> None:
+        self.at, self._clock, self._since_s = "starting", clock, clock()
+        self._spent_s: dict[str, float] = {}
+
+    def enter(self, phase: str) -> None:
+        """Come to another phase, or stay in this one."""
+        self._spent_s, self.at, self._since_s = self.spent_s(), phase, self._clock()
+
+    def spent_s(self) -> dict[str, float]:
+        """The time in each phase until now (s)."""
+        now_s = self._spent_s.get(self.at, 0.0) + self._clock() - self._since_s
+        return self._spent_s | {self.at: now_s}
+
+
 @dataclass(frozen=True)
 class Situation:
     """How the pool is: what the supervisor knows, what the run does at present, and who waits since when.
 
-    waits_since_s, now_s   by the pool's clock (s)
+    phases_s                           the time in each phase (s)
+    waits_since_s, durable_s, now_s    by the pool's clock (s); `durable_s` is when the newest episode became so
     """
 
     state: PoolState
     phase: str
+    phases_s: Mapping[str, float]
     waits_since_s: Mapping[str, float]
+    durable_s: float | None
     now_s: float
 
 

@@ -11,7 +11,7 @@ from t6gps.service.pool import messages
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.decision_log import DecisionLog
 from t6gps.service.pool.messages import Instruction, Observation
-from t6gps.service.pool.outside import Outside, Situation
+from t6gps.service.pool.outside import Outside, Phases, Situation
 from t6gps.service.pool.state import Ending, PoolState, RunState, WorkerId
 from t6gps.service.pool.supervisor import decide
 from t6gps.service.pool.transport import Done, Transport
@@ -28,7 +28,7 @@ class Pool:
     """Keeps the workers of a run at work on the plans of one batch after another.
 
     state       what the supervisor knows
-    phase       what the run does at present, for its status
+    phases      what the run does at present, and how long it did what, for its status
     ticked_s    when the last round began (s, `clock`)
     quarantine  keeps a crash bundle; called with a plan whose last attempt has failed
     """
@@ -42,13 +42,14 @@ class Pool:
         log: DecisionLog | None = None,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self.state, self.phase, self.ticked_s = state, "starting", float("-inf")
+        self.state, self.phases, self.ticked_s = state, Phases(clock), float("-inf")
         self._transport, self._outside, self._quarantine = transport, outside, quarantine
         self._log, self._clock = log, clock
         self._unseen: list[Observation] = []
         self._came: dict[tuple[WorkerId, int], Episode] = {}
         self._accepted: deque[tuple[int, Episode]] = deque()
         self._waits: dict[str, float] = {}
+        self._durable_s: float | None = None
 
     def tick(self, wait_s: float = 0.0) -> None:
         """One round: observe, decide, carry out. Waits up to `wait_s` for news, which are for the next round.
@@ -70,7 +71,7 @@ class Pool:
     def open(self, plans: Sequence[EpisodePlan], quarantined: Sequence[int], policy_digests: Mapping[int, str]) -> None:
         """Begin a batch; what comes of other plans than these is late."""
         self._accepted.clear()
-        self.phase = "sampling"
+        self.phases.enter("sampling")
         self._unseen.append(messages.Opened(tuple(plans), tuple(quarantined), policy_digests, self.state.ledger.worked))
         self._decide()
 
@@ -87,6 +88,7 @@ class Pool:
         while self._accepted:
             episode_id, episode = self._accepted.popleft()
             keep(episode)
+            self._durable_s = self._clock()
             self._unseen.append(messages.Durable(episode_id))
             self._decide()
 
@@ -110,7 +112,8 @@ class Pool:
 
     def situation(self) -> Situation:
         """How the pool is, for whoever tells others."""
-        return Situation(self.state, self.phase, self._waits, self._clock())
+        at, spent_s = self.phases.at, self.phases.spent_s()
+        return Situation(self.state, at, spent_s, self._waits, self._durable_s, self._clock())
 
     def _listen(self, wait_s: float) -> None:
         """Take what the transport reports; episodes stay here, the supervisor sees their size."""

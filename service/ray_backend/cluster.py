@@ -20,6 +20,7 @@ from ray.util.scheduling_strategies import NodeAffinitySchedulingStrategy
 from t6gps.service import caller, checks, machine
 from t6gps.service.checks import Wanted
 from t6gps.service.config import WORKERS_MOST_N, Config
+from t6gps.service.logs import Speaker
 from t6gps.service.ray_backend import private, starting
 from t6gps.storage.errors import RunError
 
@@ -109,13 +110,13 @@ def _join_or_start(config: Config, connected: ExitStack) -> int:
     return int(cpus_n / each + 1e-6)
 
 
-def start_actor(plain: type, *arguments: Any, cpus: float = 0, where: str = SPREAD) -> Actor:
-    """A handle to an actor made from a plain class, on the node `where` (or spread over all).
+def start_actor(plain: type, speaker: Speaker, *arguments: Any, cpus: float = 0, where: str = SPREAD) -> Actor:
+    """A handle to an actor made from a plain class, on the node `where` (or spread over all), that logs as `speaker`.
 
     Ray restarts none: what an actor held would be lost unnoticed.
     """
     place: Any = where if where == SPREAD else NodeAffinitySchedulingStrategy(where, soft=False)
-    return ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy=place)(plain).remote(*arguments)
+    return ray.remote(num_cpus=cpus, max_restarts=0, scheduling_strategy=place)(plain).remote(speaker, *arguments)
 
 
 def this_node() -> str:

@@ -7,6 +7,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from t6gps.service import logs
+from t6gps.service.logs import Speaker
 from t6gps.service.pool.messages import PostMortem
 from t6gps.service.ray_backend import private, processes
 from t6gps.service.ray_backend.processes import Process
@@ -15,7 +17,8 @@ from t6gps.service.ray_backend.processes import Process
 class NodeAgentActor:
     """Looks at the workers of its node, and ends them."""
 
-    def __init__(self) -> None:
+    def __init__(self, speaker: Speaker) -> None:
+        logs.begin(speaker)
         self._logs = private.logs_folder()
 
     def examine(self, process: Process, died: bool) -> PostMortem:

@@ -15,6 +15,8 @@ from typing import NamedTuple
 
 import ray
 
+from t6gps.service import logs
+from t6gps.service.logs import Role, Speaker
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.ray_backend import private, processes
 from t6gps.service.ray_backend.cluster import Actor, start_actor
@@ -31,7 +33,8 @@ _log = logging.getLogger(__name__)
 class PolicyServerActor:
     """Holds the newest policies for whoever asks."""
 
-    def __init__(self) -> None:
+    def __init__(self, speaker: Speaker) -> None:
+        logs.begin(speaker)
         self._process = processes.dump_stacks_on_signal()
         self._held: dict[int, PolicySnapshot] = {}
 
@@ -75,7 +78,9 @@ class PolicyServer:
         self._start()
 
     def _start(self) -> None:
-        self.source = PolicySource(start_actor(PolicyServerActor, where=self._node), self._started_n)
+        self.source = PolicySource(
+            start_actor(PolicyServerActor, logs.other(Role.POLICY_SERVER), where=self._node), self._started_n
+        )
         self.process: Process | None = None
         self._started_n += 1
         for version in sorted(self._held):
@@ -131,7 +136,7 @@ class PolicyServer:
 
     def _replace(self, why: str) -> None:
         log = "" if self.process is None else processes.log_tail(self._logs, self.process.pid)
-        last_words = log.strip().rpartition("\n")[2]
+        last_words = logs.said(log.strip().rpartition("\n")[2])
         self._deaths.add(f"it {why}" + (f" ({last_words})" if last_words else ""))
         _log.warning("the policy server %s; another one takes its place", why)
         ray.kill(self.source.actor)

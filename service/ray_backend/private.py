@@ -17,6 +17,7 @@ from typing import Any
 
 from ray._private import node, services
 from ray._private import worker as ray_worker
+from ray._private.authentication.http_token_authentication import get_auth_headers_if_auth_enabled
 from ray._private.state import actors, available_resources_per_node
 from ray._raylet import AuthenticationTokenLoader, Config, wait_for_persisted_port  # type: ignore[attr-defined]
 from ray.job_config import JobConfig
@@ -53,6 +54,12 @@ def read_authentication() -> None:
     """Let Ray read mode and token from the environment again: it does so once, and somebody may have used it before."""
     Config.initialize("")
     AuthenticationTokenLoader.instance().reset_cache()
+
+
+def authentication_headers() -> dict[str, str]:
+    """What a request by HTTP carries to a cluster with a token; nothing where no token is in use."""
+    headers: dict[str, str] = get_auth_headers_if_auth_enabled({})
+    return headers
 
 
 def without_working_folder() -> JobConfig:

@@ -18,7 +18,7 @@ from typing import Any
 
 import ray
 
-from t6gps.service import caller
+from t6gps.service import caller, logs
 from t6gps.service.ray_backend import private, processes
 
 DEADLINE_S = 45.0
@@ -69,6 +69,7 @@ def _hold(options: dict[str, Any], connected: Future[None], over: threading.Even
     private.read_authentication()
     try:
         ray.init(log_to_driver=False, logging_level=logging.ERROR, **options)
+        logs.adopt("ray")
     except BaseException as error:  # it is raised where somebody waits
         _end_what_is_left(before)
         connected.set_exception(error)

@@ -17,6 +17,8 @@ from typing import Any
 
 import ray
 
+from t6gps.service import logs
+from t6gps.service.logs import Role
 from t6gps.service.pool.attempt import Failure
 from t6gps.service.pool.deadlines import Timings
 from t6gps.service.pool.messages import Alive, Died, PostMortem, Ready
@@ -91,7 +93,7 @@ class RayTransport(Transport):
         self._asked_nodes = False
 
     def start(self, worker: WorkerId) -> None:
-        actor = start_actor(WorkerActor, cpus=self._cpus)
+        actor = start_actor(WorkerActor, logs.other(Role.WORKER, slot=worker.slot), cpus=self._cpus)
         self._begin(worker, Remote(actor), actor.open.remote(self._make_worker, self._settings, self.policies.source))
 
     def _begin(self, worker: WorkerId, remote: Remote, opened: Reference) -> None:
@@ -148,7 +150,7 @@ class RayTransport(Transport):
         remote.process, remote.node = started.process, started.identity.node_id
         lasting = self._agent_deaths[remote.node] < AGENT_DEATHS_N
         if remote.node != self._node and remote.node not in self._agents and lasting:
-            self._agents[remote.node] = start_actor(NodeAgentActor, where=remote.node)
+            self._agents[remote.node] = start_actor(NodeAgentActor, logs.other(Role.NODE_AGENT), where=remote.node)
         return Ready(worker, started.identity)
 
     def _done(self, call: Call, answer: Answer, at_s: float) -> Done:

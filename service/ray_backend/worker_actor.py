@@ -5,12 +5,13 @@ from __future__ import annotations
 import os
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import pyarrow as pa
 import ray
 
-from t6gps.service import provenance, threads
+from t6gps.service import logs, provenance, threads
+from t6gps.service.logs import Speaker
 from t6gps.service.pool.attempt import Failure, Runner, attempt, policy_digest, settings_digest
 from t6gps.service.pool.state import Identity
 from t6gps.service.ray_backend import cluster, processes
@@ -51,7 +52,9 @@ class Answer:
 class WorkerActor:
     """Runs plans one after the other, each with the policy that it names."""
 
-    def __init__(self) -> None:
+    def __init__(self, speaker: Speaker) -> None:
+        logs.begin(speaker)
+        self._speaker = speaker
         self._process = processes.dump_stacks_on_signal()
         self._worker: Runner | None = None
         self._source: PolicySource | None = None
@@ -84,7 +87,8 @@ class WorkerActor:
             return self._without_policy(self._source.number)
         if snapshot is None:
             return self._without_policy(None)
-        result = attempt(self._worker, plan, snapshot)
+        with logs.speaking(replace(self._speaker, episode=plan.episode_id)):
+            result = attempt(self._worker, plan, snapshot)
         if isinstance(result, Failure):
             return Answer(failure=result, policy_digest=self._digest)
         return Answer(ipc.pack(result.frames, result.summary), policy_digest=self._digest)

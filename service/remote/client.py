@@ -191,7 +191,7 @@ class Client:
         return self._server.events(f"{_run(name)}/events", last)
 
     def files(self, name: str, whole: bool = True) -> dict[str, File]:
-        """The files of a run that nobody trains, by their paths in it; or else only those that its policy acts with."""
+        """The files of a run that nobody trains, by their paths in it; or else only those of its world."""
         return self._server.get(f"{_run(name)}/files?whole={str(whole).lower()}", dict[str, File])
 
     def pieces(self, name: str, path: str, offset: int = 0) -> Iterator[bytes]:

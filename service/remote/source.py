@@ -1,4 +1,4 @@
-"""A run of a server as files: to fetch it whole, or to have at hand what its policy acts with."""
+"""A run of a server as files: to fetch it whole, or to have its world at hand."""
 
 from __future__ import annotations
 
@@ -32,7 +32,7 @@ class FarSource:
 
 @contextmanager
 def at_hand(client: Client, name: str) -> Iterator[Run]:
-    """The run in a folder of this machine meanwhile, without its data: its newest policy can be evaluated.
+    """The run in a folder of this machine meanwhile, without its data: its configuration, origin and ground.
 
     RunError where a file comes altered.
     """

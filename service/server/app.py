@@ -7,20 +7,24 @@ from http import HTTPStatus
 from importlib import metadata
 from pathlib import Path
 
-from fastapi import FastAPI, Request
+from fastapi import APIRouter, FastAPI, Request
 from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
+from t6gps.service.monitoring import exporter
+from t6gps.service.monitoring.exporter import Exporter
 from t6gps.service.remote.messages import Health
 from t6gps.service.server.guard import Clock, Guard, Limits, refusal, utc_now
 from t6gps.service.server.launching import Launch, launch
 from t6gps.service.server.routes import administering, jobs, operating, reading, stored
-from t6gps.service.server.routes.access import NoSuchRunError, Served
+from t6gps.service.server.routes.access import REFUSALS, Answers, NoSuchRunError, Reading, Served, Slots
 from t6gps.storage.errors import ConfigError, QueryError, RunError, ServerError, T6GpsError
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
 DEFAULT_LIMITS = Limits()
+SCRAPES_N = 4
+"""Scrapes that may wait for each other; who comes then is told to come back."""
 _log = logging.getLogger(__name__)
 
 
@@ -42,7 +46,14 @@ def create(
     app = FastAPI(title="t6gps", version=version, docs_url=None, redoc_url=None, redirect_slashes=False)
     app.state.served = Served(root, start)
     app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now, limits=limits)
-    for routes in (reading.routes, stored.routes, jobs.routes, operating.routes, administering.routes):
+    for routes in (
+        reading.routes,
+        stored.routes,
+        jobs.routes,
+        operating.routes,
+        administering.routes,
+        _monitoring(root),
+    ):
         app.include_router(routes)
 
     @app.get("/v1/health", tags=["read"])
@@ -56,6 +67,20 @@ def create(
     app.add_exception_handler(OSError, _refused)
     app.add_exception_handler(Exception, _broken)
     return app
+
+
+def _monitoring(root: Path) -> APIRouter:
+    """The route for Prometheus, which knows it by this path."""
+    routes, known, slots = APIRouter(responses=REFUSALS, tags=["read"]), Exporter(root), Slots(SCRAPES_N)
+    answers: Answers = {200: {"content": {"text/plain": {}}, "description": "Metrics as text."}}
+
+    @routes.get("/metrics", dependencies=[Reading], response_class=Response, responses=answers)
+    def metrics() -> Response:
+        """How the server and the runs are, for Prometheus."""
+        with slots.taken():
+            return Response(known.text(), media_type=exporter.CONTENT_TYPE)
+
+    return routes
 
 
 def _refused(request: Request, error: Exception) -> Response:

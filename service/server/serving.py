@@ -56,6 +56,7 @@ def serve(root: Path, address: Address, say: Callable[[str], object]) -> None:
             ws="none",
             lifespan="off",
             log_level="warning",
+            log_config=None,
             access_log=False,
             server_header=False,
             proxy_headers=False,

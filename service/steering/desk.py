@@ -14,6 +14,8 @@ from t6gps.service.steering.requests import Inbox, What
 from t6gps.service.steering.status import PUBLISH_S
 from t6gps.storage.catalog import Run
 
+TROUBLE = (EventKind.WAITING, EventKind.CRASH, EventKind.HANG)
+"""Events that are warnings in the log. Quarantine and failure have lines of their own."""
 _log = logging.getLogger(__name__)
 
 
@@ -42,7 +44,7 @@ class Desk(Outside):
     def told(self, situation: Situation, at_once: bool = False) -> None:
         if at_once or situation.now_s - self._published_s >= PUBLISH_S:
             self._published_s = situation.now_s
-            status.publish(self._run, status.describe(situation), self._request_id or None, self._most)
+            status.publish(self._run, status.describe(situation, self._request_id or None, self._most))
 
     def ended(self, situation: Situation) -> None:
         self._write(situation, (), ())
@@ -54,5 +56,11 @@ class Desk(Outside):
         self._standing = after
         self._events.write(happened, situation.phase)
         for each in happened:
-            if each.event is EventKind.WAITING:
-                _log.warning("%s", each.reason)
+            level = logging.WARNING if each.event in TROUBLE else logging.INFO
+            _log.log(level, "%s: %s", each.event, each.reason, extra={"slot": each.slot, "episode": each.episode})
+        for failed in observed:
+            if isinstance(failed, messages.Failed):
+                where = {"slot": failed.worker.slot, "episode": failed.plan.episode_id}
+                _log.warning(
+                    "worker %s: episode %d: %s", failed.worker, failed.plan.episode_id, failed.failure, extra=where
+                )

@@ -68,10 +68,12 @@ NO_TROUBLE = {
 
 @dataclass(frozen=True)
 class Happened:
-    """An event without its time: what, and why, in words."""
+    """An event without its time: what, and why, in words; of which slot and episode, None where it has none."""
 
     event: EventKind
     reason: str
+    slot: int | None = None
+    episode: int | None = None
 
 
 class Event(TypedDict):
@@ -135,15 +137,18 @@ def _done(state: PoolState, instruction: Instruction) -> Iterator[Happened]:
     match instruction:
         case messages.End() if instruction.why is not Ending.DRAINED:
             kind = EventKind.HANG if instruction.why is Ending.HANG else EventKind.CRASH
-            yield Happened(kind, f"worker {instruction.worker}: {state.slots[instruction.worker.slot].trouble}")
+            slot = instruction.worker.slot
+            plans = state.workers[slot].plans
+            in_hand = plans[0].episode_id if plans else None
+            yield Happened(kind, f"worker {instruction.worker}: {state.slots[slot].trouble}", slot, in_hand)
         case messages.Start() if trouble := state.slots[instruction.worker.slot].trouble:
-            yield Happened(EventKind.REPLACEMENT, f"worker {instruction.worker}; the last one there: {trouble}")
+            reason = f"worker {instruction.worker}; the last one there: {trouble}"
+            yield Happened(EventKind.REPLACEMENT, reason, instruction.worker.slot)
         case messages.Quarantine():
             number = instruction.plan.episode_id
             history = state.ledger.failures[number]
-            yield Happened(
-                EventKind.QUARANTINE, f"episode {number} after {len(history)} attempts; the last: {history[-1]}"
-            )
+            reason = f"episode {number} after {len(history)} attempts; the last: {history[-1]}"
+            yield Happened(EventKind.QUARANTINE, reason, episode=number)
 
 
 def _started(state: PoolState, decided: Sequence[Instruction]) -> Iterator[Happened]:

@@ -8,7 +8,9 @@ from __future__ import annotations
 import json
 import os
 import time
+from typing import Required
 
+from pydantic import TypeAdapter, ValidationError
 from typing_extensions import TypedDict  # pydantic cannot check those of `typing` before Python 3.12
 
 from t6gps.service.pool.outside import Situation
@@ -44,33 +46,40 @@ class Status(TypedDict, total=False):
     """How a run is. `ready` of `wanted` workers take plans; `most` may be asked for.
 
     request           id of the last request that was taken
+    phases_s          time in each phase since the process began (s)
+    durable_for_s     since the newest episode became durable (s), None before the first
     backlog           episodes of the batch that are neither durable nor quarantined
     leases, arrived   of these, with a worker, and back but not durable
     episodes          counts of the whole run, by `ledger.COUNTERS`;   processes    of workers
     """
 
-    time_s: float
-    pid: int
+    time_s: Required[float]
+    pid: Required[int]
     request: str | None
     most: int
-    state: str
+    state: Required[str]
     reason: str
     phase: str
+    phases_s: dict[str, float]
+    durable_for_s: float | None
     wanted: int
     ready: int
-    workers: list[WorkerStatus]
+    workers: Required[list[WorkerStatus]]
     backlog: int
     leases: int
     arrived: int
     bytes_in_flight: int
-    waits: list[Wait]
+    waits: Required[list[Wait]]
     quarantined: list[int]
     episodes: dict[str, int]
     processes: dict[str, int]
 
 
-def describe(situation: Situation) -> Status:
-    """The status that a pool's situation makes."""
+_STATUS = TypeAdapter(Status)
+
+
+def describe(situation: Situation, request: str | None, most: int) -> Status:
+    """The status of this process's run, which a pool's situation makes; see `Status` for the others."""
     state, now, waits_since_s = situation.state, situation.now_s, situation.waits_since_s
     ledger, workers = state.ledger, list(state.workers.values())
     idle_s = [now - worker.since_s for worker in workers if worker.phase is WorkerPhase.IDLE]
@@ -79,9 +88,15 @@ def describe(situation: Situation) -> Status:
         waits.append({"what": f"{len(idle_s)} workers wait for plans", "for_s": round(min(idle_s), 3)})
     under_way_n = len(ledger.leases) + ledger.arrived
     return {
+        "time_s": time.time(),
+        "pid": os.getpid(),
+        "request": request,
+        "most": most,
         "state": state.condition,
         "reason": state.reason,
         "phase": situation.phase,
+        "phases_s": {phase: round(spent_s, 3) for phase, spent_s in situation.phases_s.items()},
+        "durable_for_s": None if situation.durable_s is None else round(now - situation.durable_s, 3),
         "wanted": state.wanted,
         "ready": sum(worker.ready for worker in workers),
         "workers": [_describe_worker(worker, now) for worker in workers],
@@ -108,14 +123,28 @@ def _describe_worker(worker: Worker, now: float) -> WorkerStatus:
     }
 
 
-def publish(run: Run, status: Status, request: str | None, most: int) -> None:
+def publish(run: Run, status: Status) -> None:
     """Replace a run's status in one step. It need not survive a crash: then it would be wrong."""
     path = run.pool / "status.json"
     path.parent.mkdir(exist_ok=True)
-    known = {"time_s": time.time(), "pid": os.getpid(), "request": request, "most": most}
     draft = durable.hidden(path)
-    draft.write_text(json.dumps({**known, **status}) + "\n")
+    draft.write_text(json.dumps(status) + "\n")
     draft.replace(path)
+
+
+def last_said(run: Run) -> Status | None:
+    """The status as the run's process wrote it last, None when the run never had workers. RunError when damaged."""
+    path = run.pool / "status.json"
+    try:
+        return _STATUS.validate_json(path.read_bytes())
+    except FileNotFoundError:
+        return None
+    except ValidationError as error:
+        fault = error.errors()[0]
+        reason = f"{'.'.join(map(str, fault['loc'])) or 'the file'}: {fault['msg']}"
+    except OSError as error:
+        reason = str(error.strerror)
+    raise RunError(f"cannot read {path}: {reason}; resume the run, which writes it anew")
 
 
 def status(run: Run) -> Status:
@@ -123,15 +152,9 @@ def status(run: Run) -> Status:
 
     What a process left behind that has ended without a word is said to be STOPPED. RunError when the run has none.
     """
-    path = run.pool / "status.json"
-    try:
-        newest: Status = json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise RunError(
-            f"run {run.name} has no status: it was never run with workers; start it with t6gps train"
-        ) from None
-    except (OSError, ValueError) as error:
-        raise RunError(f"cannot read {path}: {error}; resume the run, which writes it anew") from None
+    newest = last_said(run)
+    if newest is None:
+        raise RunError(f"run {run.name} has no status: it was never run with workers; start it with t6gps train")
     if newest["state"] in ENDED:
         return newest
     if catalog.process_of(run) != newest["pid"]:

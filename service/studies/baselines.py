@@ -11,6 +11,7 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
+import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.service import seeding
@@ -18,8 +19,9 @@ from t6gps.service.config import Config
 from t6gps.service.seeding import Branch
 from t6gps.service.studies.declared import Baseline
 from t6gps.service.studies.watcher import Progress, Watcher
-from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training import evaluation, evaluation_records, origin, session
 from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.training.evaluation_records import Occasion, Purpose
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint, durable
 from t6gps.storage.catalog import Run
@@ -59,18 +61,31 @@ def complete(baseline: Baseline, config: Config, run: Run, watcher: Watcher) -> 
         evaluation.keep(run, evaluate(baseline, run, (), True, observer))
 
 
-def evaluate(baseline: Baseline, run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:
-    """The evaluation of a finished baseline on the episodes that any policy of this run would get."""
+def evaluate(
+    baseline: Baseline,
+    run: Run,
+    overrides: Sequence[str],
+    serial: bool,
+    observer: Observer,
+    condition: str | None = None,
+) -> Evaluation:
+    """The evaluation of a finished baseline on the episodes that any policy of this run would get, and it is kept."""
     if baseline is Baseline.PPO:
-        return session.evaluate_newest(run, overrides, serial, observer)
+        return session.evaluate_newest(run, overrides, serial, observer, condition)
     config = origin.configured(run, overrides)
     nominal_m = nominal_rest_length(config.robot)
     control = gaits.flop(nominal_m) if baseline is Baseline.FLOP else gaits.waves(nominal_m, _kept_gait(run))
-    size = config.run
+    size, summaries = config.run, list[pa.Table]()
     plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
-    with PyBulletEngine(config.robot) as simulation:
-        summaries = [controlled(simulation, config.rollout, plan, control, 0, nominal_m).summary for plan in plans]
-    return evaluation.summarise(summaries, size.seed)
+    with PyBulletEngine(config.robot) as simulation, evaluation_records.collecting(run) as episodes:
+        for plan in plans:
+            episode = controlled(simulation, config.rollout, plan, control, 0, nominal_m)
+            summaries.append(episode.summary)
+            episodes.append(episode)
+        result = evaluation.summarise(summaries, size.seed)
+        purpose = Purpose.TRAINING if condition is None else Purpose.CONDITION
+        evaluation_records.commit(run, config, result, episodes, Occasion(purpose, condition), 0)
+    return result
 
 
 def _keep_gait(run: Run, parameters: Array) -> None:

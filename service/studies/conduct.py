@@ -150,7 +150,8 @@ def conduct(
         progress = f"condition {number} of {len(unseen)}: {condition}, run {trial.name}"
         watcher.say(f"{progress}; {minutes(pace.left_s())} left")
         run = catalog.open_run(root, trial.name)
-        evaluation.keep(run, _evaluated(trial, run, conditions[condition], serial, watcher), condition)
+        overrides = conditions[condition]
+        evaluation.keep(run, _evaluated(trial, run, condition, overrides, serial, watcher), condition)
         pace.done(_condition_s(trial))
     return [_finished(root, trial, conditions) for trial in planned]
 
@@ -177,12 +178,14 @@ def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
     run_figures.draw(run, run_origin.configured(run))
 
 
-def _evaluated(trial: Trial, run: Run, overrides: Sequence[str], serial: bool, watcher: Watcher) -> Evaluation:
-    """The evaluation of a trial's policy in the world that the overrides change."""
+def _evaluated(
+    trial: Trial, run: Run, condition: str, overrides: Sequence[str], serial: bool, watcher: Watcher
+) -> Evaluation:
+    """The evaluation of a trial's policy in the world that the overrides of a condition change."""
     with watcher.run(trial.config.run.iterations) as observer:
         if trial.declared.baseline is not None:
-            return baselines.evaluate(trial.declared.baseline, run, overrides, serial, observer)
-        return session.evaluate_newest(run, overrides, serial, observer)
+            return baselines.evaluate(trial.declared.baseline, run, overrides, serial, observer, condition)
+        return session.evaluate_newest(run, overrides, serial, observer, condition)
 
 
 def _finished(root: Path, trial: Trial, conditions: Iterable[str]) -> Finished:

@@ -104,7 +104,7 @@ def largest_climb(finished: Sequence[Finished]) -> Climb:
     """The largest height gain among the stored episodes of all runs."""
     tops = [(query(outcome.run, LARGEST_CLIMBS).slice(0, 1).to_pylist()[0], outcome) for outcome in finished]
     best, outcome = max(tops, key=lambda item: item[0]["gain_m"])
-    frames = tables.episode_frames(outcome.run, best["episode_id"]).sort_by("step")
+    frames = tables.episode(outcome.run, best["episode_id"]).frames.sort_by("step")
     row = tables.read(outcome.run, "episodes", filter=pc.field("episode_id") == best["episode_id"]).to_pylist()[0]
     terrain = ground(outcome.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
     top = best["top_step"]

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 
@@ -16,7 +16,7 @@ from t6gps.service.training.loop import Observer, mean_and_error
 from t6gps.storage import durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
-from t6gps.storage.records import Episode
+from t6gps.storage.records import Episode, PolicySnapshot
 
 EVALUATED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
@@ -78,16 +78,25 @@ class Evaluation:
 
 
 def evaluate(
-    config: Config, executor: Executor, episodes: int, seed: int, terrain_seed: int | None, observer: Observer
+    config: Config,
+    executor: Executor,
+    episodes: int,
+    seed: int,
+    terrain_seed: int | None,
+    observer: Observer,
+    policy: PolicySnapshot | None = None,
+    append: Callable[[Episode], object] | None = None,
 ) -> Evaluation:
-    """Run the learner's policy in `episodes` noise-free episodes."""
-    snapshot = executor.learner.policy()
+    """Run a policy, by default the learner's newest, in `episodes` noise-free episodes; each is handed to `append`."""
+    snapshot = executor.learner.policy() if policy is None else policy
     plans = seeding.evaluation_plans(config, episodes, seed, terrain_seed, snapshot.version)
     summaries: dict[int, pa.Table] = {}
 
     def keep(episode: Episode) -> None:
         copy = episode.summary.take([0])  # the episode's memory is not held
         summaries[copy["index"][0].as_py()] = copy
+        if append is not None:
+            append(episode)
         observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
 
     executor.sample(plans, snapshot, keep, Purpose.EVALUATION)

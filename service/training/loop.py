@@ -11,6 +11,7 @@ they have sampled is in the spool when the iteration's turn comes, which then re
 
 from __future__ import annotations
 
+import logging
 import time
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -26,15 +27,19 @@ from t6gps.learner.port import Manifest
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
-from t6gps.storage import checkpoint, tables
+from t6gps.storage import checkpoint
 from t6gps.storage.catalog import Run
 from t6gps.storage.checkpoint import JSON
+from t6gps.storage.delta import iterations
 from t6gps.storage.errors import LearnerDiedError, RunError
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, Learned, PolicySnapshot
 from t6gps.storage.spool import Spool, read
 
 LEARNER_DEATHS_ALLOWED_N = 3
 """In one iteration."""
+COMMIT = "commit"
+"""The phase in which an iteration is committed and its checkpoint is written."""
+_log = logging.getLogger(__name__)
 
 
 class Observer(Protocol):
@@ -68,10 +73,11 @@ def train(config: Config, run: Run, executor: Executor, observer: Observer) -> N
                 _iterate(config, run, executor, observer, iteration)
                 deaths_n = 0
             return
-        except LearnerDiedError:
+        except LearnerDiedError as error:
             deaths_n += 1
             if deaths_n > LEARNER_DEATHS_ALLOWED_N:
                 raise
+            _log.warning("%s; another one resumes from the newest checkpoint", error)
             executor.replace_learner()
 
 
@@ -122,12 +128,14 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
         with _timed(durations, phase.duration_column):
             for done, total in executor.learn(phase):
                 observer.progress(iteration, phase.name, done, total)
-    learned, classes = executor.learner.report()
+    report = executor.learner.report()
     summaries = pa.concat_tables([read(path).summary.take([0]) for path in files]).combine_chunks()
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
-    row |= _sampled(summaries) | learned | durations
+    row |= _sampled(summaries) | report.iteration | durations
     row["left_out"] = len(plans) - len(files)
-    tables.commit_iteration(run, iteration, _tended(executor, files), row, classes)
+    policies = [executor.learner.policy()] if iteration else [batch.snapshot, executor.learner.policy()]
+    learned = Learned(row, report.classes, report.models, policies)
+    iterations.commit(run, iteration, _tended(executor, files), learned)
     state = executor.learner.state()
     manifest = cast(dict[str, JSON], {**state.manifest, "ledger": executor.ledger.state()})
     checkpoint.save(run.checkpoints, iteration + 1, manifest, state.arrays)
@@ -144,7 +152,7 @@ def _sample_ahead(config: Config, run: Run, executor: Executor, iteration: int) 
 def _tended(executor: Executor, files: Sequence[Path]) -> Iterator[Episode]:
     """Episodes one after the other; the pool is tended meanwhile."""
     for file in files:
-        executor.tend()
+        executor.tend(COMMIT)
         yield read(file)
 
 

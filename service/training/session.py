@@ -4,24 +4,27 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import closing, contextmanager
+from dataclasses import dataclass
 from enum import StrEnum
 from pathlib import Path
-from typing import TYPE_CHECKING, cast
+from typing import TYPE_CHECKING
 
-from t6gps.learner.port import Manifest
-from t6gps.service import caller, checks
+from t6gps.service import caller, checks, logs
 from t6gps.service import config as configuration
 from t6gps.service.checks import Wanted
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
+from t6gps.service.logs import Role
 from t6gps.service.pool.state import RunState
 from t6gps.service.steering.watch import heeding
-from t6gps.service.training import evaluation, loop, origin
+from t6gps.service.training import evaluation, evaluation_records, loop, origin, policies
 from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.training.evaluation_records import Occasion, Purpose
 from t6gps.service.training.loop import Observer
-from t6gps.storage import catalog, checkpoint
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import LearnerDiedError, RunError
+from t6gps.storage.records import PolicySnapshot
 
 if TYPE_CHECKING:
     from t6gps.workers.physics import engine as physics
@@ -109,7 +112,8 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
     Everything sampled is kept when KeyboardInterrupt comes, also by `t6gps stop`. A run is removed whose first executor
     does not start.
     """
-    with catalog.locked(run), _named(run):
+    speaker = logs.other(Role.SUPERVISOR, run.name)
+    with catalog.locked(run), _named(run), logs.speaking(speaker):
         config = origin.at_work(config, run)
         try:
             with heeding(run):
@@ -141,11 +145,12 @@ def train_and_evaluate(config: Config, run: Run, executor: Executor, observer: O
 
     A learner that dies after the last iteration is replaced, as one that dies before.
     """
-    deaths_n, size = 0, config.run
+    deaths_n = 0
     while True:
         loop.train(config, run, executor, observer)
         try:
-            return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
+            policy = executor.learner.policy()
+            return _own_evaluation(run, config, executor, policy, Occasion(Purpose.TRAINING), observer)
         except LearnerDiedError:
             deaths_n += 1
             if deaths_n > loop.LEARNER_DEATHS_ALLOWED_N:
@@ -153,12 +158,77 @@ def train_and_evaluate(config: Config, run: Run, executor: Executor, observer: O
             executor.replace_learner()
 
 
-def evaluate_newest(run: Run, overrides: Sequence[str], serial: bool, observer: Observer) -> Evaluation:
-    """Evaluate a run's newest policy in the world that `overrides` change, on the seeds of the run's own evaluation."""
-    config = origin.configured(run, overrides)
-    with closing(restored(config, run, serial)) as executor:
-        size = config.run
-        return evaluation.evaluate(config, executor, size.evaluation_episodes, size.seed, None, observer)
+@dataclass(frozen=True)
+class Asked:
+    """Noise-free episodes: how many, on which seeds, of which policy, and whether the run keeps them.
+
+    terrain_seed   of the ground alone
+    version        of the policy, the newest by default
+    """
+
+    episodes: int
+    seed: int
+    terrain_seed: int | None = None
+    version: int | None = None
+    keep: bool = True
+
+
+def evaluate(
+    run: Run,
+    config: Config,
+    asked: Asked,
+    serial: bool,
+    engine: Engine,
+    observer: Observer,
+    policy: PolicySnapshot | None = None,
+) -> tuple[Evaluation, int | None]:
+    """Evaluate a policy in the world of a configuration; the result, and its number where it is kept.
+
+    RunError for a policy that the run does not keep, and before its first one.
+    """
+    policy = policy or policies.load(run, asked.version)
+    with closing(start_executor(config, serial, engine=engine)) as executor:
+        if asked.keep:
+            occasion = Occasion(Purpose.EVAL, terrain_seed=asked.terrain_seed, engine=engine.value)
+            return _kept_evaluation(run, config, executor, policy, asked, occasion, observer)
+        size = (asked.episodes, asked.seed, asked.terrain_seed)
+        return evaluation.evaluate(config, executor, *size, observer, policy), None
+
+
+def evaluate_newest(
+    run: Run, overrides: Sequence[str], serial: bool, observer: Observer, condition: str | None = None
+) -> Evaluation:
+    """Evaluate a run's newest policy in the world that `overrides` change, on the seeds of the run's own evaluation.
+
+    It is kept as that of a study's condition, or as the one that ends the training.
+    """
+    config, policy = origin.configured(run, overrides), policies.load(run, None)
+    occasion = Occasion(Purpose.TRAINING if condition is None else Purpose.CONDITION, condition)
+    with closing(start_executor(config, serial)) as executor:
+        return _own_evaluation(run, config, executor, policy, occasion, observer)
+
+
+def _own_evaluation(
+    run: Run, config: Config, executor: Executor, policy: PolicySnapshot, occasion: Occasion, observer: Observer
+) -> Evaluation:
+    """The evaluation of a policy that the run's configuration asks for."""
+    asked = Asked(config.run.evaluation_episodes, config.run.seed)
+    return _kept_evaluation(run, config, executor, policy, asked, occasion, observer)[0]
+
+
+def _kept_evaluation(
+    run: Run,
+    config: Config,
+    executor: Executor,
+    policy: PolicySnapshot,
+    asked: Asked,
+    occasion: Occasion,
+    observer: Observer,
+) -> tuple[Evaluation, int]:
+    with evaluation_records.collecting(run) as episodes:
+        size = (asked.episodes, asked.seed, asked.terrain_seed)
+        result = evaluation.evaluate(config, executor, *size, observer, policy, episodes.append)
+        return result, evaluation_records.commit(run, config, result, episodes, occasion, policy.version)
 
 
 def evaluation_config(run: Run, overrides: Sequence[str], warn: Warn) -> Config:
@@ -169,18 +239,3 @@ def evaluation_config(run: Run, overrides: Sequence[str], warn: Warn) -> Config:
     configuration.check_keys(overrides, "eval", EVALUATION_SECTIONS, "the policy is trained already")
     tell_changes(run, warn)
     return origin.configured(run, overrides)
-
-
-def restored(config: Config, run: Run, serial: bool, engine: Engine = Engine.BULLET) -> Executor:
-    """An executor whose learner is that of the run's newest checkpoint. RunError if there is none yet."""
-    latest = checkpoint.load_latest(run.checkpoints)
-    if latest is None:
-        raise RunError(f"run {run.name} has no checkpoint yet; let it finish an iteration")
-    executor = start_executor(config, serial, engine=engine)
-    _, manifest, arrays = latest
-    try:
-        executor.learner.restore(cast(Manifest, manifest), arrays)
-    except BaseException:
-        executor.close()
-        raise
-    return executor

@@ -36,7 +36,8 @@ class RunSummary:
 def summary(run: Run) -> RunSummary:
     """A run in a line; what cannot be read of it is its fault, and hides no other run."""
     try:
-        planned, done = origin.configured(run).run.iterations, tables.files(run)[0]
+        planned, done = origin.configured(run).run.iterations, tables.committed_iterations(run)
+        tables.files(run)  # all are whole
         last = iterations(run, done - 1)[-1:]
     except T6GpsError as error:
         return RunSummary(name=run.name, fault=str(error))

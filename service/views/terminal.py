@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, contextmanager
@@ -24,11 +25,16 @@ from rich.progress import (
 from rich.table import Table
 
 from t6gps.learner.phases import PHASES
+from t6gps.service import logs
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage.sql.query import Head
 
+_log = logging.getLogger(__name__)
 console = Console(stderr=True)
 """Progress and messages go to stderr, results to stdout, so that results can be piped."""
+
+LABELS = {logging.WARNING: ("warning: ", "yellow"), logging.ERROR: ("error: ", "red")}
+"""What messages begin with, and their colour."""
 
 PHASE_TITLES = {"sample": "sampling", **{phase.name: phase.title for phase in PHASES}, "evaluate": "evaluation"}
 """What the bar of each phase says."""
@@ -83,14 +89,22 @@ ARM_COLUMNS = {
 }
 
 
-def say(sentence: str, style: str | None = None) -> None:
-    """Print a message as it is, on one line however wide the terminal."""
-    console.print(sentence, style=style, highlight=False, soft_wrap=True, markup=False)
+def say(sentence: str, level: int = logging.INFO) -> None:
+    """Print a message as it is, on one line however wide the terminal; or log it, where lines are objects."""
+    if logs.as_json():
+        _log.log(level, "%s", sentence)
+        return
+    label, style = LABELS.get(level, ("", None))
+    console.print(label + sentence, style=style, highlight=False, soft_wrap=True, markup=False)
 
 
 def warn(sentence: str) -> None:
     """Print a warning."""
-    say(f"warning: {sentence}", style="yellow")
+    say(sentence, logging.WARNING)
+
+
+def _shows_bars() -> bool:
+    return console.is_terminal and not logs.as_json()
 
 
 class ProgressDisplay:
@@ -99,7 +113,7 @@ class ProgressDisplay:
     def __init__(self, iterations: int) -> None:
         self._iterations = iterations
         self._tasks: dict[tuple[int, str], TaskID] = {}
-        self._progress = Progress(*_columns(), console=console, disable=not console.is_terminal)
+        self._progress = Progress(*_columns(), console=console, disable=not _shows_bars())
 
     def __enter__(self) -> ProgressDisplay:
         self._progress.start()
@@ -140,7 +154,7 @@ def _estimate(mean: float, standard_error: float | None) -> str:
 @contextmanager
 def task(title: str) -> Iterator[Callable[[int, int], None]]:
     """A single bar; gives the function that moves it."""
-    with Progress(*_columns(), console=console, transient=True, disable=not console.is_terminal) as progress:
+    with Progress(*_columns(), console=console, transient=True, disable=not _shows_bars()) as progress:
         bar = progress.add_task(title, total=None)
         yield lambda done, total: progress.update(bar, completed=done, total=total)
 

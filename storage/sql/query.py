@@ -1,6 +1,6 @@
 """SQL over the tables of a run, safe for questions from strangers.
 
-DuckDB runs in a child process (`sandbox`) that sees the four tables and nothing else: no files, no network,
+DuckDB runs in a child process (`sandbox`) that sees the tables and nothing else: no files, no network,
 no settings; one SELECT, bounded in length, nesting, memory, time and result.
 """
 
@@ -15,13 +15,14 @@ import sys
 import tempfile
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from typing import BinaryIO
 
 import pyarrow as pa
 
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import log
 from t6gps.storage.errors import QueryError
 from t6gps.storage.sql import sandbox
 
@@ -53,11 +54,12 @@ class Head:
 
 
 def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
-    """The result of one SELECT over the tables frames, episodes, iterations and classes of `run`.
+    """The result of one SELECT over the tables of `run`.
 
     Only committed iterations are seen. Of two columns with one name, the second gets a number: cost, cost_1. Raises
-    QueryError, with DuckDB's own sentence first where there is one, for SQL that is refused or wrong, and beyond 64 kB
-    of SQL, 100 nested brackets, 2 GiB of memory, a result of 1 GB or `timeout_s` seconds.
+    DataError for a run that is not whole. QueryError, with DuckDB's own sentence first where there is one, for SQL that
+    is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of 1 GB or `timeout_s`
+    seconds.
     """
     with _answer(run, sql, "arrow", timeout_s) as result:
         return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
@@ -83,8 +85,8 @@ def head(run: Run, sql: str, *, timeout_s: float = 30.0) -> Head:
 def _answer(run: Run, sql: str, form: str, timeout_s: float) -> Iterator[BinaryIO]:
     """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
     _check_size(sql)
-    iterations_n, files = tables.files(run)
-    question = {"sql": sql, "form": form, "iterations_n": iterations_n, "files": files, "timeout_s": timeout_s}
+    files = {table: asdict(found) for table, found in tables.files(run).items()}
+    question = {"sql": sql, "form": form, "files": files, "timeout_s": timeout_s}
     with tempfile.TemporaryFile() as result:
         try:
             child = subprocess.run(
@@ -102,7 +104,10 @@ def _answer(run: Run, sql: str, form: str, timeout_s: float) -> Iterator[BinaryI
                 "iteration, or read the Parquet files directly"
             ) from error
         if child.returncode:
-            raise QueryError(_reason(child.returncode, child.stderr.decode(errors="replace").strip()))
+            message = child.stderr.decode(errors="replace").strip()
+            if child.returncode == sandbox.DAMAGED:
+                raise log.damaged(run, *json.loads(message))
+            raise QueryError(_reason(child.returncode, message))
         result.seek(0)
         yield result
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import re
 import resource
 import sys
 from collections.abc import Mapping
@@ -19,14 +20,16 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
-from t6gps.storage import parquet
+from t6gps.storage.delta import parquet
 from t6gps.storage.errors import QueryError
 from t6gps.storage.sql import advice, formats
 
 RESULT_BYTES_N = 10**9
 MEMORY_BYTES_N = 2 * 1024**3
-REFUSED, TOO_LARGE = 2, 3
+REFUSED, TOO_LARGE, DAMAGED = 2, 3, 4
 
+_FAULT = re.compile(r"Invalid Input Error: reading the stream registered as '(\w+)' failed: (.*)")
+"""What DuckDB says of a table that pyarrow cannot read: its name, and why."""
 _THREADS_N = 2
 _SETTINGS = (
     f"SET threads = {_THREADS_N}",
@@ -55,7 +58,7 @@ def _limit(timeout_s: float) -> None:
 def _relation(question: Mapping[str, Any]) -> duckdb.DuckDBPyRelation:
     connection = duckdb.connect(":memory:")
     for table, files in question["files"].items():
-        connection.register(table, parquet.rows(table, files, question["iterations_n"]))
+        connection.register(table, parquet.rows(table, parquet.Files(**files)))
     for setting in _SETTINGS:
         connection.execute(setting)
     _limit(question["timeout_s"])
@@ -66,7 +69,7 @@ def _relation(question: Mapping[str, Any]) -> duckdb.DuckDBPyRelation:
 
 
 def main() -> int:
-    """Answer the question on the standard input; the exit status is 0, REFUSED or TOO_LARGE."""
+    """Answer the question on the standard input; the exit status is 0, REFUSED, TOO_LARGE or DAMAGED."""
     pa.set_cpu_count(_THREADS_N)
     pa.set_io_thread_count(_THREADS_N)
     question = json.load(sys.stdin)
@@ -76,6 +79,9 @@ def main() -> int:
     except (duckdb.Error, pa.ArrowException, OSError, MemoryError, QueryError) as error:
         if isinstance(error, OSError) and error.errno == errno.EFBIG:
             return TOO_LARGE
+        if fault := _FAULT.match(str(error)):
+            print(json.dumps(fault.groups()), file=sys.stderr)
+            return DAMAGED
         print(advice.explained(error, question["sql"]), file=sys.stderr)
         return REFUSED
     return 0

@@ -57,7 +57,7 @@ def test_a_marker_without_a_measurement_is_refused(render: ModuleType, tmp_path:
         render.rendered(page)
 
 
-@pytest.mark.parametrize("marker", ["figures: rough", "states: run"])
+@pytest.mark.parametrize("marker", ["figures: rough", "states: run", "metrics", "alerts"])
 def test_a_marker_without_an_end_is_refused(marker: str, render: ModuleType, tmp_path: Path) -> None:
     page = tmp_path / "page.md"
     page.write_text(f"<!-- {marker} -->\n")
@@ -74,6 +74,15 @@ def test_every_state_stands_on_a_page_with_what_may_follow_it(render: ModuleType
         if following is not None:
             named = [set(re.findall(r"`(\w+)`", row[2])) for row in rows]
             assert named == [{str(state) for state in following[member]} for member in kind]
+
+
+def test_every_metric_and_every_alert_stands_on_a_page(render: ModuleType) -> None:
+    text = "\n".join(page.read_text(encoding="utf-8") for page in render.pages())
+    assert sorted(mark[1] for mark in render.MARKED_LISTS.finditer(text)) == ["alerts", "metrics"]
+    assert all(f"| `{metric.name}` |" in text for metric in render.METRICS)
+    names = re.findall(r"- alert: (\w+)", render.ALERTS.read_text(encoding="utf-8"))
+    assert names
+    assert all(f"| `{name}` |" in text for name in names)
 
 
 def test_the_meaning_of_a_state_is_its_docstring(render: ModuleType) -> None:

@@ -275,7 +275,7 @@ def test_t13_while_the_learner_pauses_nothing_piles_up_and_nothing_is_dropped(ho
         while time.monotonic() < end_s:
             pool.tick(0.05)
             most = max(most, len(ledger.leases) + ledger.arrived)
-            bytes_ = max(bytes_, int(statuses.describe(pool.situation())["bytes_in_flight"]))
+            bytes_ = max(bytes_, int(statuses.describe(pool.situation(), None, 8)["bytes_in_flight"]))
 
     sampled = house.sample(pause)
     assert most == 4

@@ -18,7 +18,7 @@ from t6gps.learner.phases import PHASES
 from t6gps.learner.policy import initial
 from t6gps.learner.rows import Rows
 from t6gps.learner.settings import LearnerSettings, ReducedState
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.records import PolicySnapshot
 
 Array = NDArray[np.float64]
@@ -32,11 +32,11 @@ def frames_table(columns: dict[str, Any], rows: int) -> pa.Table:
     """A table that follows FRAMES; columns that are not given hold zeros."""
     arrays = []
     for field in schema.FRAMES:
-        length, values = schema.vector_length(field), columns.get(field.name)
+        length, values = fields.vector_length(field), columns.get(field.name)
         if values is None:
             values = [0] * rows if length is None else np.zeros((rows, length), dtype=np.float32)
         arrays.append(pa.array(list(values), type=field.type))
-    return schema.check(pa.Table.from_arrays(arrays, schema=schema.FRAMES), schema.FRAMES, "test episode")
+    return fields.check(pa.Table.from_arrays(arrays, schema=schema.FRAMES), schema.FRAMES, "test episode")
 
 
 def stay_table(stays: list[tuple[int, int, int | None, int | None]]) -> pa.Table:

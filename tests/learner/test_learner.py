@@ -14,7 +14,7 @@ from t6gps.learner.cost import running_cost
 from t6gps.learner.learner import Learner
 from t6gps.learner.rows import Rows
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import CheckpointError, DataError, RunError
 from t6gps.storage.records import PolicySnapshot
 
@@ -100,14 +100,33 @@ def test_the_report_fills_the_columns_of_its_tables(
 ) -> None:
     learner = make_learner()
     iterate(learner, tables)
-    iteration, classes = learner.report()
+    iteration, classes, models = learner.report()
     assert set(iteration) <= set(schema.ITERATIONS.names)
-    table = schema.check(pa.Table.from_pylist(classes, schema=schema.CLASSES), schema.CLASSES, "classes")
+    table = fields.check(pa.Table.from_pylist(classes, schema=schema.CLASSES), schema.CLASSES, "classes")
     actions = sum(table.num_rows - 1 for table in tables)
     assert sum(table.column("rows").to_pylist()) == actions
     assert sum(table.column("segments").to_pylist()) == iteration["segments"]
     assert iteration["classes"] == table.column("pooled").to_pylist().count(False)
     assert iteration["predicted_cost_change"] < 0 < iteration["action_change_m"]
+    fields.check(models, schema.MODELS, "models")
+
+
+def test_the_models_of_the_report_explain_the_samples_that_they_say(
+    tables: list[pa.Table], rows: Rows, make_learner: Callable[..., Learner], iterate: Iterate
+) -> None:
+    learner = make_learner()
+    iterate(learner, tables)
+    iteration, _, models = learner.report()
+    found = models.to_pylist()
+    assert sum(model["samples"] for model in found) == rows.continues.sum()
+    weighted = sum(model["samples"] * model["residual"] for model in found if model["samples"])
+    assert weighted / rows.continues.sum() == pytest.approx(iteration["residual"])
+    places = [(model["bin"], model["step"], model["mode"]) for model in found]
+    assert sorted(set(places)) == places
+    nx, nu = rows.state.shape[1], rows.action.shape[1]
+    sizes = [len(model["dynamics_matrix"]) for model in found] + [len(model["policy_matrix"]) for model in found]
+    assert set(sizes) == {nx * (nx + nu), nu * nx}
+    assert all((np.array(model["action_variance"]) >= 0).all() for model in found)
 
 
 def test_the_report_of_an_iteration_is_the_mean_of_its_classes_over_their_rows(
@@ -115,7 +134,7 @@ def test_the_report_of_an_iteration_is_the_mean_of_its_classes_over_their_rows(
 ) -> None:
     learner, episodes = make_learner(), rows
     iterate(learner, tables)
-    iteration, classes = learner.report()
+    iteration, classes, _ = learner.report()
     change = policy.act(learner.snapshot, episodes.observation).clip(0.65, 1.35) - episodes.action_mean
     variance = np.nanmean((episodes.action - episodes.action_mean) ** 2)
     assert iteration["policy_kl"] == pytest.approx(np.nanmean((change**2).sum(axis=1)) / 2 / variance, rel=1e-4)
@@ -157,7 +176,7 @@ def test_a_policy_without_noise_and_winches_at_their_limit_are_learned_from(
         constant = np.full_like(schema.array(table, "action"), 1.35)
         planted.append(with_column(with_column(table, "action", constant), "action_mean", constant))
     iterate(learner, planted)
-    iteration, classes = learner.report()
+    iteration, classes, _ = learner.report()
     assert all(np.isfinite(value) for row in [iteration, *classes] for value in row.values() if value is not None)
     assert iteration["saturated_share"] == 1.0
     assert iteration["action_change_m"] < 1e-3, "actions that were never varied have no known effect"
@@ -168,7 +187,7 @@ def test_a_class_with_one_sample_is_learned_from(
 ) -> None:
     learner = make_learner(smallest_class_segments=1)
     iterate(learner, tables[:2])
-    iteration, classes = learner.report()
+    iteration, classes, _ = learner.report()
     assert min(row["rows"] for row in classes) == 1
     assert np.isfinite(learner.state()[1]["replay_0_actions"]).all()
     assert iteration["predicted_cost_change"] < 0

@@ -150,7 +150,7 @@ def test_libraries_compute_with_one_thread_while_it_is_asked_for(tmp_path: Path)
 def test_a_run_gives_what_is_stored(run: t6gps.Run) -> None:
     folder = catalog.open_run(run.path.parent, run.name)
     assert run == t6gps.open_run(run.path) == t6gps.runs(run.path.parent)[0]
-    assert run.episode(3).equals(tables.episode_frames(folder, 3))
+    assert run.episode(3).equals(tables.episode(folder, 3).frames)
     assert run.table("frames", ["step"]).equals(tables.read(folder, "frames", ["step"]))
     assert run.query("SELECT count(*) AS n FROM episodes").to_pylist() == [{"n": 12}]
     assert run.config.run.steps == 40
@@ -167,9 +167,11 @@ def test_a_policy_commands_what_the_learned_network_does(run: t6gps.Run) -> None
 
 
 def test_an_evaluation_says_what_its_settings_make_of_the_policy(run: t6gps.Run) -> None:
-    first = t6gps.evaluate(run, episodes=2, seed=0, serial=True)
+    first = t6gps.evaluate(run, episodes=2, seed=0, keep=False, serial=True)
     assert first == run.evaluation
-    assert t6gps.evaluate(run, episodes=2, seed=0, settings={"task.directions": 1}, serial=True) != first
+    other = t6gps.evaluate(run, episodes=2, seed=0, settings={"task.directions": 1}, keep=False, serial=True)
+    assert other != first
+    assert t6gps.evaluate(run, episodes=2, seed=0, version=0, keep=False, serial=True) != first
 
 
 def test_progress_tells_every_phase_and_every_finished_iteration(run: t6gps.Run, tmp_path: Path) -> None:
@@ -216,7 +218,7 @@ def test_an_error_of_progress_stops_the_run_which_can_be_resumed(
         (lambda run: run.query("DROP TABLE frames"), t6gps.QueryError, "refused"),
         (lambda run: run.table("frames", ["speed"]), DataError, "no column 'speed'"),
         (lambda run: run.episode(99), DataError, "no episode 99"),
-        (lambda run: run.policy(version=7), t6gps.RunError, "kept: 1, 2"),
+        (lambda run: run.policy(version=7), t6gps.RunError, "kept: 0, 1, 2"),
         (lambda run: run.policy()([0.0] * 24), DataError, "83 finite numbers, found 24"),
         (lambda run: run.policy()([float("nan")] * 83), DataError, "0 of them finite"),
         (lambda run: run.policy()("north"), DataError, "83 finite numbers"),
@@ -235,8 +237,8 @@ def test_what_cannot_be_is_refused_in_words(
 
 def test_a_run_without_a_checkpoint_has_no_policy(tmp_path: Path, run: t6gps.Run) -> None:
     bare = t6gps.open_run(catalog.create(tmp_path, "bare", run.config.to_json()).path)
-    with pytest.raises(t6gps.RunError, match="no checkpoint yet"):
+    with pytest.raises(t6gps.RunError, match="no policy yet"):
         bare.policy()
-    with pytest.raises(t6gps.RunError, match="no checkpoint yet"):
+    with pytest.raises(t6gps.RunError, match="no policy yet"):
         t6gps.evaluate(bare, serial=True)
     assert bare.evaluation is None

@@ -7,14 +7,17 @@ import shutil
 from collections.abc import Callable, Iterator
 from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
+from typing import Any
 
+import numpy as np
 import pyarrow as pa
 import pytest
 from run_digest import column_bytes
 
-from t6gps.storage import catalog, schema, tables
+from t6gps.storage import catalog, schema
 from t6gps.storage.catalog import Run
-from t6gps.storage.records import Episode
+from t6gps.storage.delta import iterations
+from t6gps.storage.records import Episode, Learned, PolicySnapshot
 
 Commit = Callable[[Run, int], list[Episode]]
 
@@ -30,6 +33,38 @@ def class_rows(iteration: int) -> list[dict[str, object]]:
     return [row | flags, row | flags | {"entry_edge": None}]
 
 
+def policy(version: int) -> PolicySnapshot:
+    """A small random policy."""
+    rng = np.random.default_rng(version)
+    widths = ((3, 4), (4, 2))
+    layers = tuple(
+        (rng.normal(size=(outputs, inputs)).astype(np.float32), rng.normal(size=outputs).astype(np.float32))
+        for inputs, outputs in widths
+    )
+    return PolicySnapshot(version, layers, 0.9, 0.2)
+
+
+def learned(number: int, **changed: Any) -> Learned:
+    """What an iteration leaves beside its episodes; parts may be given."""
+    model = {field.name: [0.5, -0.0] if pa.types.is_list(field.type) else 1 for field in schema.MODELS}
+    models = pa.Table.from_pylist([model | {"iteration": number, "truncated": None, "pooled": True}], schema.MODELS)
+    return Learned(
+        **{
+            "iteration": iteration_row(number),
+            "classes": class_rows(number),
+            "models": models,
+            "policies": [policy(version) for version in ((0, 1) if number == 0 else (number + 1,))],
+        }
+        | changed
+    )
+
+
+@pytest.fixture
+def learn() -> Callable[..., Learned]:
+    """learn(iteration, **parts) is what an iteration leaves beside its episodes."""
+    return learned
+
+
 @pytest.fixture
 def run(tmp_path: Path) -> Run:
     return catalog.create(tmp_path / "runs", "trial", "{}")
@@ -41,7 +76,7 @@ def commit(make_episode: Callable[..., Episode]) -> Commit:
 
     def commit_three(run: Run, iteration: int) -> list[Episode]:
         episodes = [make_episode(100 * iteration + index, iteration) for index in range(3)]
-        tables.commit_iteration(run, iteration, iter(episodes), iteration_row(iteration), class_rows(iteration))
+        iterations.commit(run, iteration, iter(episodes), learned(iteration))
         return episodes
 
     return commit_three
@@ -84,12 +119,6 @@ def full_disk() -> Callable[[], AbstractContextManager[None]]:
             resource.setrlimit(resource.RLIMIT_FSIZE, (before, most))
 
     return full
-
-
-@pytest.fixture
-def rows() -> tuple[Callable[[int], dict[str, object]], Callable[[int], list[dict[str, object]]]]:
-    """The makers of an iteration's row and of its classes' rows."""
-    return iteration_row, class_rows
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import numpy as np
 import pyarrow as pa
 import pytest
 
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import DataError
 
 NODES = schema.FRAMES.get_field_index("nodes")
@@ -39,15 +39,15 @@ def test_one_bad_entry_is_found_wherever_it_lies_and_only_in_what_is_looked_at(m
         broken, reason = _broken(frames, row)[case]
         for table in (broken, pa.concat_tables([frames, broken]), pa.concat_tables([frames, broken]).slice(2)):
             with pytest.raises(DataError, match=reason):
-                schema.check(table, schema.FRAMES, "frames")
-        schema.check(broken.slice(1) if row == 0 else broken.slice(0, row), schema.FRAMES, "frames")
+                fields.check(table, schema.FRAMES, "frames")
+        fields.check(broken.slice(1) if row == 0 else broken.slice(0, row), schema.FRAMES, "frames")
 
 
 def test_columns_are_as_declared(make_episode: Any) -> None:
     frames = make_episode(1, 0).frames
-    assert schema.check(frames, schema.FRAMES, "frames") is frames
+    assert fields.check(frames, schema.FRAMES, "frames") is frames
     with pytest.raises(DataError, match="columns must be"):
-        schema.check(frames.drop_columns("cost"), schema.FRAMES, "frames")
+        fields.check(frames.drop_columns("cost"), schema.FRAMES, "frames")
     single = frames.set_column(NODES, "nodes", frames.column("nodes").cast(pa.list_(pa.float64())))
     with pytest.raises(DataError, match=r"column nodes must be list<item: float>, found list<item: double>"):
-        schema.check(single, schema.FRAMES, "frames")
+        fields.check(single, schema.FRAMES, "frames")

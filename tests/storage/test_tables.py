@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
@@ -14,13 +15,14 @@ import pytest
 from deltalake import DeltaTable, write_deltalake
 from deltalake.transaction import CommitProperties, Transaction
 
-from t6gps.storage import catalog, schema, tables
+from t6gps.storage import catalog, fields, schema, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import iterations, policies
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
 from t6gps.storage.sql.query import query
 
-ORDER = ["frames", "classes", "iterations", "episodes"]
+ORDER = ["frames", "classes", "models", "policies", "iterations", "episodes"]
 """In which tables are committed: an iteration is there when it stands in the last one."""
 
 
@@ -39,7 +41,7 @@ def test_what_was_committed_is_what_was_sampled_bit_for_bit(run: Run, commit: An
     assert bits(tables.read(run, "episodes")) == bits(summaries)
 
 
-@pytest.mark.parametrize("table", schema.TABLES)
+@pytest.mark.parametrize("table", schema.OF_ITERATIONS)
 def test_what_is_read_has_the_schema_to_the_letter(run: Run, commit: Any, table: str) -> None:
     assert tables.read(run, table).num_rows == 0
     assert tables.read(run, table).schema.equals(schema.TABLES[table], check_metadata=True)
@@ -47,15 +49,53 @@ def test_what_is_read_has_the_schema_to_the_letter(run: Run, commit: Any, table:
     found = tables.read(run, table)
     assert found.num_rows > 0
     assert found.schema.equals(schema.TABLES[table], check_metadata=True)
-    schema.check(found, schema.TABLES[table], "read")
+    fields.check(found, schema.TABLES[table], "read")
 
 
-def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, rows: Any) -> None:
-    iteration_row, class_rows = rows
+def test_rows_of_the_learner_are_kept_as_given(run: Run, commit: Any, learn: Any, bits: Any) -> None:
     commit(run, 0)
     commit(run, 1)
-    assert tables.read(run, "iterations").to_pylist() == [iteration_row(0), iteration_row(1)]
-    assert tables.read(run, "classes").to_pylist() == class_rows(0) + class_rows(1)
+    given = [learn(0), learn(1)]
+    assert tables.read(run, "iterations").to_pylist() == [learned.iteration for learned in given]
+    assert tables.read(run, "classes").to_pylist() == [row for learned in given for row in learned.classes]
+    assert bits(tables.read(run, "models")) == bits(pa.concat_tables([learned.models for learned in given]))
+
+
+def test_every_policy_is_kept_to_the_bit_under_its_version(run: Run, commit: Any, learn: Any) -> None:
+    commit(run, 0)
+    commit(run, 1)
+    for policy in (*learn(0).policies, *learn(1).policies):
+        kept = tables.policy(run, policy.version)
+        assert (kept.version, kept.offset_m, kept.scale_m) == (policy.version, policy.offset_m, policy.scale_m)
+        for layer, given in zip(kept.layers, policy.layers, strict=True):
+            assert all(np.array_equal(part, wanted) for part, wanted in zip(layer, given, strict=True))
+    lineage = tables.read(run, "policies", ["version", "iteration", "parent"]).to_pylist()
+    assert [tuple(row.values()) for row in lineage] == [(0, None, None), (1, 0, 0), (2, 1, 1)]
+
+
+def test_a_policy_that_was_altered_fails_its_sum(learn: Any) -> None:
+    row = policies.row(learn(0).policies[1])
+    policies.policy(row)
+    with pytest.raises(DataError, match="policy 1 fails its SHA-256"):
+        policies.policy(row | {"weights": np.nextafter(row["weights"], np.float32(np.inf))})
+
+
+def test_a_run_of_version_5_is_read_without_models_and_policies_and_can_go_on(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    for name in schema.YOUNGER:
+        shutil.rmtree(run.tables / name)
+    with pytest.raises(DataError, match=r"table models .* it is missing"):
+        tables.files(run)
+    file = run.tables / "episodes" / "iteration-000000.parquet"
+    older = pq.read_table(file).replace_schema_metadata({"t6gps_schema_version": "5"})
+    pq.write_table(older, file)
+    log = run.tables / "episodes" / "_delta_log" / f"{1:020d}.json"
+    log.write_text(re.sub(r'"size":\d+', f'"size":{file.stat().st_size}', log.read_text()))
+    assert [tables.read(run, name).num_rows for name in schema.YOUNGER] == [0, 0]
+    tables.files(run)
+    commit(run, 1)
+    tables.files(run)
+    assert tables.read(run, "policies", ["version"]).to_pylist() == [{"version": 2}]
 
 
 def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_and_can_go_on(
@@ -77,9 +117,8 @@ def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_a
         assert table.column("cost" if name == "iterations" else "residual").null_count == 0
 
 
-def test_what_there_is_none_of_is_null_also_where_an_older_run_has_zero(run: Run, commit: Any, rows: Any) -> None:
+def test_what_there_is_none_of_is_null_also_where_an_older_run_has_zero(run: Run, commit: Any, learn: Any) -> None:
     """Version 4 allowed no null in these columns of a table that is there."""
-    iteration_row, class_rows = rows
     none = {"iterations": ("cost_standard_error", "waypoints_per_episode"), "classes": ("modes", "residual")}
     episodes = commit(run, 0)
     for name, columns in none.items():
@@ -91,14 +130,14 @@ def test_what_there_is_none_of_is_null_also_where_an_older_run_has_zero(run: Run
         committed = CommitProperties(app_transactions=[Transaction("t6gps", 0)])
         write_deltalake(run.tables / name, table, commit_properties=committed)
     commit(run, 1)
-    iteration = iteration_row(2) | dict.fromkeys(none["iterations"])
-    classes = [row | dict.fromkeys(none["classes"]) for row in class_rows(2)]
+    iteration = learn(2).iteration | dict.fromkeys(none["iterations"])
+    classes = [row | dict.fromkeys(none["classes"]) for row in learn(2).classes]
     numbered = pa.array([2], pa.int32()).take
     later = [
         table.set_column(1, table.schema.field(1), numbered(pa.array([0] * table.num_rows)))
         for table in (episodes[0].frames, episodes[0].summary)
     ]
-    tables.commit_iteration(run, 2, iter([Episode(*later)]), iteration, classes)
+    iterations.commit(run, 2, iter([Episode(*later)]), learn(2, iteration=iteration, classes=classes))
     for name, columns in none.items():
         table = tables.read(run, name).sort_by("iteration")
         for column in columns:
@@ -117,15 +156,15 @@ def test_columns_and_rows_can_be_chosen(run: Run, commit: Any) -> None:
 
 def test_one_episode_is_read_whole_and_in_order(run: Run, commit: Any, bits: Any) -> None:
     episodes = commit(run, 0) + commit(run, 1)
-    assert bits(tables.episode_frames(run, 101)) == bits(episodes[4].frames)
+    assert bits(tables.episode(run, 101).frames) == bits(episodes[4].frames)
 
 
 def test_unknown_tables_columns_and_episodes_are_answered_with_those_that_exist(run: Run, commit: Any) -> None:
     with pytest.raises(DataError, match="no iteration is committed"):
-        tables.episode_frames(run, 0)
+        tables.episode(run, 0)
     commit(run, 0)
     with pytest.raises(DataError, match=r"3 episodes lie in 0 \.\. 2"):
-        tables.episode_frames(run, 3)
+        tables.episode(run, 3)
     with pytest.raises(DataError, match="no table 'frame'; tables: frames, episodes"):
         tables.read(run, "frame")
     with pytest.raises(DataError, match="no column 'speed'; columns: episode_id"):
@@ -150,7 +189,7 @@ def test_tables_are_committed_in_turn_and_episodes_last(run: Run, commit: Any) -
         assert times == sorted(times)
 
 
-@pytest.mark.parametrize("committed_n", range(4))
+@pytest.mark.parametrize("committed_n", range(len(ORDER)))
 @pytest.mark.parametrize("file_written", [False, True])
 def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by_committing_again(
     run: Run, commit: Any, commit_cut_off: Any, bits: Any, committed_n: int, file_written: bool
@@ -159,24 +198,24 @@ def test_a_crash_inside_a_commit_shows_whole_iterations_only_and_is_completed_by
     commit_cut_off(run, 1, " ".join(ORDER[:committed_n]), ORDER[committed_n] if file_written else "")
     assert tables.committed_iterations(run) == 1
     assert bits(tables.read(run, "frames")) == bits(pa.concat_tables([each.frames for each in whole]))
-    for table in schema.TABLES:
-        assert tables.read(run, table).column("iteration").unique().to_pylist() == [0]
+    for table in ORDER:
+        assert set(tables.read(run, table).column("iteration").to_pylist()) <= {0, None}
     with pytest.raises(DataError, match="has no episode 100"):
-        tables.episode_frames(run, 100)
+        tables.episode(run, 100)
 
     whole += commit(run, 1)
     assert tables.committed_iterations(run) == 2
     assert bits(tables.read(run, "frames")) == bits(pa.concat_tables([each.frames for each in whole]))
-    for table in schema.TABLES:
-        assert set(tables.read(run, table).column("iteration").to_pylist()) == {0, 1}
+    for table in ORDER:
+        assert set(tables.read(run, table).column("iteration").to_pylist()) - {None} == {0, 1}
 
 
 def test_a_cut_off_commit_is_not_completed_with_other_episodes(
-    run: Run, commit_cut_off: Any, make_episode: Any, rows: Any
+    run: Run, commit_cut_off: Any, make_episode: Any, learn: Any
 ) -> None:
     commit_cut_off(run, 0, "frames")
     with pytest.raises(DataError, match="holds other episodes"):
-        tables.commit_iteration(run, 0, [make_episode(9, 0)], rows[0](0), rows[1](0))
+        iterations.commit(run, 0, [make_episode(9, 0)], learn(0))
     assert tables.committed_iterations(run) == 0
 
 
@@ -205,18 +244,18 @@ def _bad(good: Episode, row: dict[str, object], classes: list[dict[str, object]]
 
 @pytest.mark.parametrize("case", range(10))
 def test_data_that_break_their_schema_are_refused_and_nothing_is_written(
-    run: Run, make_episode: Any, rows: Any, case: int
+    run: Run, make_episode: Any, learn: Any, case: int
 ) -> None:
-    episodes, row, classes, reason = _bad(make_episode(1, 0), rows[0](0), rows[1](0))[case]
+    episodes, row, classes, reason = _bad(make_episode(1, 0), learn(0).iteration, learn(0).classes)[case]
     before = _snapshot(run)
     with pytest.raises(DataError, match=reason):
-        tables.commit_iteration(run, 0, episodes, row, classes)
+        iterations.commit(run, 0, episodes, learn(0, iteration=row, classes=classes))
     assert _snapshot(run) == before
 
 
-def test_a_file_holds_ten_episodes_a_row_group_and_splits_noisy_floats(run: Run, make_episode: Any, rows: Any) -> None:
+def test_a_file_holds_ten_episodes_a_row_group_and_splits_noisy_floats(run: Run, make_episode: Any, learn: Any) -> None:
     episodes = [make_episode(index, 0) for index in range(23)]
-    tables.commit_iteration(run, 0, episodes, rows[0](0), [])
+    iterations.commit(run, 0, episodes, learn(0, classes=[]))
     assert tables.read(run, "classes").num_rows == 0
     metadata = pq.ParquetFile(run.tables / "frames" / "iteration-000000.parquet").metadata
     assert [metadata.row_group(group).num_rows for group in range(metadata.num_row_groups)] == [60, 60, 18]
@@ -249,7 +288,7 @@ def test_a_root_with_blanks_and_accents_works_also_when_relative(
     run = catalog.create(Path("my rüns #1"), "one", "{}")
     commit(run, 0)
     assert tables.read(run, "episodes").num_rows == 3
-    assert tables.episode_frames(run, 1).num_rows == 6
+    assert tables.episode(run, 1).frames.num_rows == 6
 
 
 DAMAGES: dict[str, Callable[[Path], object]] = {
@@ -266,7 +305,7 @@ DAMAGES: dict[str, Callable[[Path], object]] = {
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-@pytest.mark.parametrize("table", schema.TABLES)
+@pytest.mark.parametrize("table", schema.OF_ITERATIONS)
 def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: str) -> None:
     for iteration in range(3):
         commit(run, iteration)
@@ -276,3 +315,24 @@ def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: st
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="run trial is not whole"):
         query(run, "SELECT count(*) FROM frames")
+
+
+def test_a_byte_that_has_changed_in_a_page_is_damage_and_never_an_answer(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    file = run.tables / "frames" / "iteration-000000.parquet"
+    metadata = pq.read_metadata(file)
+    columns = [metadata.row_group(0).column(index) for index in range(metadata.num_columns)]
+    whole = file.read_bytes()
+    for name in ("cost", "face", "nodes.list.element"):
+        column = next(column for column in columns if column.path_in_schema == name)
+        first = column.dictionary_page_offset if column.has_dictionary_page else column.data_page_offset
+        place = first + column.total_compressed_size - 3  # in its last page
+        changed = bytearray(whole)
+        changed[place] ^= 1
+        file.write_bytes(changed)
+        with pytest.raises(DataError, match=r"run trial is not whole: table frames .*restore"):
+            tables.read(run, "frames")
+        with pytest.raises(DataError, match="run trial is not whole"):
+            query(run, f"SELECT {name.split('.')[0]} FROM frames")
+    file.write_bytes(whole)
+    tables.read(run, "frames")

@@ -10,9 +10,11 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from t6gps.storage.fields import vector_length
 from t6gps.storage.records import Episode, EpisodePlan
-from t6gps.storage.schema import EPISODES, FRAMES, vector_length
+from t6gps.storage.schema import EPISODES, FRAMES
 from t6gps.workers.episode.task import running_cost
+from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.physics.engine import CONTROL_STEP_S
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, exit_edge
@@ -80,8 +82,10 @@ class _Motion:
     cost: Array
 
 
-def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings) -> Episode:
-    """The two tables of an episode; whoever hands them on checks them."""
+def to_episode(
+    record: Record, plan: EpisodePlan, outcome: Outcome, settings: RolloutSettings, ground: Terrain | None
+) -> Episode:
+    """The two tables of an episode on its ground, None for the plane; whoever hands them on checks them."""
     motion = _motion(record, settings.task)
     shared = {
         "episode_id": plan.episode_id,
@@ -90,7 +94,7 @@ def to_episode(record: Record, plan: EpisodePlan, outcome: Outcome, settings: Ro
     }
     rows = len(record.states)
     columns: dict[str, Column] = {name: np.full(rows, value) for name, value in shared.items()}
-    columns |= _world_columns(motion) | _canonical_columns(record, motion)
+    columns |= _world_columns(motion) | _canonical_columns(record, motion) | _ground_columns(motion, ground)
     summary: dict[str, object] = shared | _summary(record, motion, plan, outcome, settings)
     return Episode(
         pa.table([_arrow(columns[f.name], f, rows) for f in FRAMES], schema=FRAMES),
@@ -141,6 +145,15 @@ def _world_columns(motion: _Motion) -> dict[str, Column]:
         "bar_orientations": motion.state.bar_orientations,
         "bar_velocities": motion.state.bar_velocities,
         "bar_angular_velocities": motion.state.bar_angular_velocities,
+    }
+
+
+def _ground_columns(motion: _Motion, ground: Terrain | None) -> dict[str, Column]:
+    """The ground under the centre of mass; the plane lies at height 0."""
+    x, y = motion.com[:, 0], motion.com[:, 1]
+    return {
+        "ground_height_m": np.zeros(len(x)) if ground is None else ground.height(x, y),
+        "ground_slope_deg": np.zeros(len(x)) if ground is None else ground.slope_deg(x, y),
     }
 
 

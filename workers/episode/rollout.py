@@ -87,7 +87,7 @@ def controlled(
         waypoints_reached=episode.course.reached,
         delay_steps=delay_steps,
     )
-    return to_episode(record, plan, outcome, settings)
+    return to_episode(record, plan, outcome, settings, episode.ground)
 
 
 def _keep(record: Record, episode: RunningEpisode) -> None:

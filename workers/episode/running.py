@@ -25,6 +25,7 @@ class RunningEpisode(Unique):
     waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
     observation               what a policy may see now [83], with the noise of the sensors if they have any
     course                    progress along the waypoints
+    ground                    None for the endless plane
     noise_rng                 the stream for exploration; start and course have streams of their own
 
     Observed rest lengths are centred on `nominal_m`, the policy's own, whatever robot it meets. Commands act
@@ -48,8 +49,8 @@ class RunningEpisode(Unique):
         start_rng, course_rng, self.noise_rng = (
             generator(seed, stream) for stream in (Stream.START, Stream.COURSE, Stream.EXPLORATION)
         )
-        terrain = ground(settings.terrain, terrain_seed, terrain_difficulty)
-        engine.set_ground(terrain)
+        self.ground = ground(settings.terrain, terrain_seed, terrain_difficulty)
+        engine.set_ground(self.ground)
         self._engine = engine
         self._sensor_noise = settings.randomisation.sensor_noise
         if self._sensor_noise:
@@ -60,7 +61,7 @@ class RunningEpisode(Unique):
             self.state = rest_start(engine, robot)
             waypoints = one_direction(number, self.state.com[:2], task.directions)
         else:
-            self.state = random_start(engine, robot, terrain, start_rng)
+            self.state = random_start(engine, robot, self.ground, start_rng)
             waypoints = random_waypoints(course_rng, self.state.com[:2], task)
         self.course = Course(waypoints, task)
         self._delayed = deque([self.state.rest_lengths] * delay_steps)

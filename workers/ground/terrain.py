@@ -40,19 +40,30 @@ class Terrain:
 
     def height(self, x: Array | float, y: Array | float) -> Array:
         """Height (m) of the triangles at x, y (m, equal shapes); beyond the sides, that of the nearest side."""
+        corner, over_x, over_y, far, a, b = self._cells(x, y)
+        below = corner + a * (over_x - corner) + b * (far - over_x)
+        above = corner + b * (over_y - corner) + a * (far - over_y)
+        return np.asarray(np.where(a >= b, below, above))
+
+    def slope_deg(self, x: Array | float, y: Array | float) -> Array:
+        """Slope (deg) of the triangles at x, y (m, equal shapes); beyond the sides, that of the nearest side."""
+        corner, over_x, over_y, far, a, b = self._cells(x, y)
+        below = np.hypot(over_x - corner, far - over_x)
+        above = np.hypot(over_y - corner, far - over_y)
+        return np.degrees(np.arctan(np.where(a >= b, below, above) / self.cell_m))
+
+    def _cells(self, x: Array | float, y: Array | float) -> tuple[Array, ...]:
+        """Heights of the cells' four corners, and the shares of the way over x and y.
+
+        The diagonal of a cell runs from its corner to the far corner; a point lies on the side of the larger share.
+        """
         last = len(self.heights) - 1
         u = np.clip(np.asarray(x, dtype=float) / self.cell_m + last / 2, 0, last)
         v = np.clip(np.asarray(y, dtype=float) / self.cell_m + last / 2, 0, last)
         i = np.minimum(u.astype(int), last - 1)
         j = np.minimum(v.astype(int), last - 1)
-        a, b = u - i, v - j
-        corner = self.heights[i, j]
-        far = self.heights[i + 1, j + 1]
-        over_x, over_y = self.heights[i + 1, j], self.heights[i, j + 1]
-        # The diagonal of a cell runs from its corner to the far corner; a point lies on the side of the larger share.
-        below = corner + a * (over_x - corner) + b * (far - over_x)
-        above = corner + b * (over_y - corner) + a * (far - over_y)
-        return np.asarray(np.where(a >= b, below, above))
+        corner, far = self.heights[i, j], self.heights[i + 1, j + 1]
+        return corner, self.heights[i + 1, j], self.heights[i, j + 1], far, u - i, v - j
 
     def triangles(self) -> tuple[Array, np.ndarray[tuple[int, int], np.dtype[np.int64]]]:
         """Vertices [n^2, 3] (m) and vertex numbers of the triangles [2 (n-1)^2, 3], anticlockwise from above."""

@@ -14,11 +14,10 @@ import pyarrow as pa
 from fastapi import APIRouter, HTTPException, Path, Query
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 
-from t6gps.service.api import policy as policies
 from t6gps.service.launch.fetch import File, FolderSource
 from t6gps.service.remote.messages import QueryForm, QueryRequest
 from t6gps.service.server.routes.access import REFUSALS, Answers, NamedRun, Place, Reading, contents
-from t6gps.service.training import evaluation
+from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
@@ -70,7 +69,7 @@ def figure(run: NamedRun, figure: Annotated[str, Path(max_length=100)]) -> FileR
 @routes.get("/{name}/policies")
 def versions(run: NamedRun) -> list[int]:
     """Versions of the policies that are kept."""
-    return sorted(checkpoint.kept(run.checkpoints))
+    return policies.versions(run)
 
 
 @routes.get(
@@ -80,10 +79,10 @@ def versions(run: NamedRun) -> list[int]:
 )
 def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=NUMBER_MOST)], place: Place) -> Response:
     """Weights of a policy: `offset_m`, `scale_m`, and `weight_K`, `bias_K` of each layer."""
-    if version not in checkpoint.kept(run.checkpoints):
+    if version not in policies.versions(run):
         raise HTTPException(HTTPStatus.NOT_FOUND, f"run {run.name} keeps no policy of version {version}")
     with place.reading.taken():
-        snapshot = policies.load(run, version).snapshot
+        snapshot = policies.load(run, version)
     arrays = {"offset_m": np.array(snapshot.offset_m), "scale_m": np.array(snapshot.scale_m)}
     weights = {f"weight_{k}": weight for k, (weight, _) in enumerate(snapshot.layers)}
     biases = {f"bias_{k}": bias for k, (_, bias) in enumerate(snapshot.layers)}
@@ -92,7 +91,7 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
 
 @routes.post("/{name}/query", response_class=Response, responses=contents(MEDIA.values(), "The result."))
 def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
-    """The result of one SELECT over the tables frames, episodes, iterations and classes."""
+    """The result of one SELECT over the tables of a run."""
     if question.form is QueryForm.HEAD:
         with place.reading.taken():
             return JSONResponse(asdict(sql.head(run, question.sql)))
@@ -112,7 +111,7 @@ def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
     """The frames of an episode, bit for bit."""
     sink = io.BytesIO()
     with place.reading.taken():
-        frames = tables.episode_frames(run, number)
+        frames = tables.episode(run, number).frames
     with pa.ipc.new_stream(sink, frames.schema) as writer:
         writer.write_table(frames)
     return Response(sink.getvalue(), media_type=MEDIA[QueryForm.ARROW])
@@ -120,7 +119,7 @@ def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
 
 @routes.get("/{name}/files")
 def files(run: NamedRun, place: Place, whole: bool = True) -> dict[str, File]:
-    """The files of a run that nobody trains, by their paths in it; or else only those that its policy acts with."""
+    """The files of a run that nobody trains, by their paths in it; or else only those of its world."""
     with place.copying.taken():
         source = FolderSource(run)
         return source.files() if whole else source.essentials()

@@ -8,7 +8,9 @@ import signal
 from collections.abc import Callable
 from pathlib import Path
 
+import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 import pytest
 import tiny_run
 from command import started, t6gps
@@ -16,6 +18,8 @@ from run_digest import digests
 from tiny_run import Trained
 
 from t6gps.storage import catalog, tables
+from t6gps.storage.sql import query
+from t6gps.workers.episode import policy as acting
 
 TINY = tiny_run.settings()
 
@@ -40,7 +44,8 @@ def test_a_finished_run_has_data_checkpoints_and_figures(tiny: Trained) -> None:
 
 
 def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
-    result = json.loads(t6gps("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", root).stdout)
+    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--json")
+    result = json.loads(t6gps(*arguments, "--root", root).stdout)
     for key in (
         "forward_speed_m_per_s",
         "stuck_share_by_distance",
@@ -52,13 +57,51 @@ def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
 
 
 def test_eval_changes_the_world_but_not_the_policy(root: Path) -> None:
-    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json")
+    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--json")
     usual = json.loads(t6gps(*arguments, "--root", root).stdout)
     for change in ("terrain.difficulty=0.5", "randomisation.sensor_noise=0.3"):
         changed = json.loads(t6gps(*arguments, "--set", change, "--root", root).stdout)
         assert usual["cost"] != changed["cost"]
     refused = t6gps(*arguments, "--set", "learner.kl_weight=1", "--root", root, code=2)
     assert "eval cannot change learner.kl_weight" in refused.stderr
+
+
+def test_eval_keeps_the_episodes_of_any_policy_in_any_world(tiny: Trained, tmp_path: Path) -> None:
+    run = catalog.copy(tiny.run, tmp_path, "copy")
+    arguments = ("eval", "copy", "--episodes", "2", "--seed", "5", "--serial", "--json", "--root", tmp_path)
+    changed = ("--set", "terrain.difficulty=0.5", "--policy", "1")
+    done = t6gps(*arguments, *changed)
+    assert "kept as evaluation 1" in done.stderr
+    row = tables.read(run, "evaluations").to_pylist()[-1]
+    assert json.loads(row["settings"]) == {"terrain.difficulty": 0.5}
+    assert (row["purpose"], row["policy_version"], row["seed"]) == ("eval", 1, 5)
+    result = json.loads(done.stdout)
+    sql = "SELECT avg(cost) AS cost FROM evaluation_episodes WHERE evaluation_id = 1"
+    assert query.query(run, sql).to_pylist() == [{"cost": pytest.approx(result["cost"]["mean"])}]
+    frames = tables.episode(run, 1, 1).frames
+    assert set(frames["policy_version"].to_pylist()) == {1}
+    assert frames["ground_slope_deg"].to_numpy().max() > 0
+    t6gps("render", "copy", "1", "--evaluation", "1", "--out", tmp_path / "still.png", "--root", tmp_path)
+    assert "keeps no evaluation 7; kept: 0, 1" in t6gps(
+        "render", "copy", "1", "--evaluation", "7", "--out", "still.png", "--root", tmp_path, code=2
+    ).stderr  # fmt: skip
+    before = tables.read(run, "evaluations").num_rows
+    t6gps(*arguments, "--no-keep")
+    assert tables.read(run, "evaluations").num_rows == before
+    refused = t6gps(*arguments, "--policy", "9", code=2)
+    assert "keeps no policy of version 9; kept: 0, 1, 2, 3" in refused.stderr
+
+
+def test_a_policy_of_before_commands_what_it_sampled_with(tiny: Trained) -> None:
+    """The actions that iterations recorded are those of their versions in the table."""
+    commands_m = tiny.config.robot.shortest_command_m, tiny.config.robot.longest_command_m
+    for version in range(3):
+        frames = tables.read(tiny.run, "frames", filter=pc.field("policy_version") == version)
+        act = acting.ready(tables.policy(tiny.run, version))
+        rows = [row for row in frames.select(["observation", "action_mean"]).to_pylist() if row["action_mean"]]
+        seen = np.array([row["observation"] for row in rows], np.float32)
+        commands = np.clip([act(observation) for observation in seen], *commands_m)
+        np.testing.assert_allclose(commands, [row["action_mean"] for row in rows], atol=1e-6)
 
 
 def test_query_gives_the_same_rows_in_every_format(root: Path) -> None:

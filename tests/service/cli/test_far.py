@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 import os
 import socket
 from collections.abc import Iterator
@@ -25,7 +26,6 @@ from t6gps.service.remote.messages import Scope, TokenRequest
 from t6gps.service.server import app as application
 from t6gps.service.server import tokens
 from t6gps.service.server.guard import utc_now
-from t6gps.service.steering import status as statuses
 from t6gps.service.steering.events import EventKind, EventLog, Happened
 from t6gps.storage import catalog
 
@@ -49,7 +49,7 @@ ANSWERS = {
     "events": [["paused"], ["paused", "--json"], ["tiny"]],
     "jobs": [[], ["--json"]],
     "logs": [["tiny"], ["tiny", "-f"]],
-    "eval": [["tiny", "--episodes", "2", "--serial", "--json", "--set", "terrain.difficulty=0.5"]],
+    "eval": [["tiny", "--episodes", "2", "--serial", "--json", "--no-keep", "--set", "terrain.difficulty=0.5"]],
     "token": [["list", "--json"]],
 }
 """What commands are asked that read."""
@@ -87,10 +87,11 @@ def place(tiny: Trained, tmp_path_factory: pytest.TempPathFactory) -> Iterator[t
     paused = catalog.create(root, "paused", tiny.config.to_json())
     log = EventLog(paused.pool)
     log.write([Happened(EventKind.START, "slot 0: 1 wanted"), Happened(EventKind.PAUSED, "asked for")], "sampling")
-    status: statuses.Status = {"state": "PAUSED", "reason": "", "phase": "sampling", "wanted": 0, "ready": 0}
-    counts: statuses.Status = {"backlog": 3, "leases": 0, "arrived": 0, "bytes_in_flight": 0, "waits": []}
-    lists: statuses.Status = {"workers": [], "quarantined": [7], "episodes": {"committed": 4}, "processes": {}}
-    statuses.publish(paused, {**status, **counts, **lists}, None, 4)
+    head = {"time_s": 0.0, "pid": 1, "request": None, "most": 4}
+    state = {"state": "PAUSED", "reason": "", "phase": "sampling", "wanted": 0, "ready": 0}
+    counts = {"backlog": 3, "leases": 0, "arrived": 0, "bytes_in_flight": 0, "waits": []}
+    lists = {"workers": [], "quarantined": [7], "episodes": {"committed": 4}, "processes": {}}
+    (paused.pool / "status.json").write_text(json.dumps({**head, **state, **counts, **lists}))
     token = tokens.issue(root, TokenRequest(name="me", scope=Scope.ADMIN, days=1.0), utc_now()).token
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("T6GPS_STATE", str(home / "state"))

@@ -129,7 +129,10 @@ def test_reading_needs_no_permission_to_write(root: Path, tmp_path: Path) -> Non
         assert "STOPPED" in t6gps("status", "tiny", "--root", root).stdout.decode()
         t6gps("query", "tiny", "SELECT count(*) FROM frames", "--root", root)
         t6gps("render", "tiny", "0", "--out", tmp_path / "still.png", "--root", root)
-        t6gps("eval", "tiny", "--episodes", "2", "--serial", "--root", root)
+        t6gps("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--root", root)
+        keeps = t6gps("eval", "tiny", "--episodes", "2", "--serial", "--root", root, code=2)
+        assert "cannot keep an evaluation" in keeps.stderr
+        assert "--no-keep" in keeps.stderr
         refused = t6gps("train", "flat-quick", "--run", "tiny", "--resume", "--serial", *tiny_run.settings(),
                         "--root", root, code=2)  # fmt: skip
     assert "permission is missing" in refused.stderr
@@ -140,7 +143,7 @@ def test_what_a_run_was_made_with_and_is_another_now_is_a_warning(root: Path) ->
     record = json.loads(path.read_text())
     record["versions"]["numpy"] = "1.0.0"
     path.write_text(json.dumps(record))
-    done = t6gps("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", root)
+    done = t6gps("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--json", "--root", root)
     assert f"warning: run tiny was made with numpy 1.0.0 (now {np.__version__})" in done.stderr
     assert json.loads(done.stdout)["episodes"] == 2
 

@@ -15,6 +15,7 @@ from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch import submission
 from t6gps.service.launch import target as targets
+from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.target import Kind, Local, Slurm
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
@@ -113,10 +114,10 @@ def test_a_cluster_that_cannot_be_used_gives_one_error_and_nothing_is_left(
     assert not records.jobs()
 
 
-@pytest.mark.parametrize("kind", ["ray", "k8s"])
+@pytest.mark.parametrize("kind", ["k8s"])
 def test_a_kind_of_target_that_is_not_supported_yet_is_refused(tmp_path: Path, kind: str) -> None:
     done = t6gps("submit", "flat-quick", "--to", kind, "--root", tmp_path / "runs", code=2)
-    assert "allowed: local, slurm" in " ".join(done.stderr.split())
+    assert "allowed: local, ray, slurm" in " ".join(done.stderr.split())
 
 
 def test_a_root_that_cannot_hold_jobs_is_refused(tmp_path: Path) -> None:
@@ -146,6 +147,17 @@ def test_a_job_has_its_ground_and_configuration_in_the_root(tmp_path: Path) -> N
     copy = planned.folder.path / "ground" / "hill.npy"
     assert configuration.load(str(planned.folder.config)).terrain.file == str(copy)
     assert np.load(copy).shape == (81, 81)
+
+
+def test_a_folder_that_is_written_for_another_root_has_its_ground_there(tmp_path: Path) -> None:
+    source = tmp_path / "hill.npy"
+    np.save(source, np.linspace(0, 1, 81 * 81).reshape(81, 81))
+    config = configuration.load("flat-quick", [f"terrain.file={source}"])
+    (tmp_path / "draft").mkdir()
+    folders.write(config, Folder(Path("/mnt/runs/.jobs/a")), tmp_path / "draft")
+    assert (tmp_path / "draft" / "ground" / "hill.npy").read_bytes() == source.read_bytes()
+    written = configuration.load(str(tmp_path / "draft" / "config.toml"))
+    assert written.terrain.file == "/mnt/runs/.jobs/a/ground/hill.npy"
 
 
 def test_a_submission_that_fails_puts_the_earlier_folder_back(tmp_path: Path) -> None:
@@ -194,6 +206,7 @@ def test_jobs_lists_the_others_where_one_target_cannot_be_asked(tmp_path: Path) 
     assert rows["there"]["state"] is None
     assert "ask there" in rows["there"]["detail"]
     assert rows["here"]["state"] == "failed"
+    assert "without a word or a log; let its nodes share the root" in rows["here"]["detail"]
 
 
 def test_a_record_that_is_damaged_is_named(states: Path) -> None:

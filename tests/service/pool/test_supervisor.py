@@ -197,7 +197,7 @@ def test_an_episode_that_always_raises_is_quarantined_after_three_failures_and_t
     house.paper.raising.add(5)
     assert sorted(house.sample()) == [n for n in range(12) if n != 5]
     assert [plan.episode_id for plan in house.quarantined] == [5]
-    found = status.describe(house.pool.situation())
+    found = status.describe(house.pool.situation(), None, 8)
     assert found["quarantined"] == [5]
     assert found["episodes"]["failures"] == 3
 
@@ -348,3 +348,20 @@ def test_a_resumed_batch_whose_only_missing_episode_fails_does_not_end_the_run()
 @pytest.mark.parametrize("phases", [NEXT_PHASES, NEXT_STATES], ids=["worker", "run"])
 def test_every_state_is_in_its_table_of_transitions(phases: dict[Any, set[Any]]) -> None:
     assert set(phases) == set(type(next(iter(phases))))
+
+
+def test_the_status_counts_the_time_in_each_phase_and_since_the_newest_episode() -> None:
+    house = House(2, 12)
+    assert status.describe(house.pool.situation(), None, 8)["durable_for_s"] is None
+    house.sample()
+    sampled_s = status.describe(house.pool.situation(), None, 8)["phases_s"]["sampling"]
+    for phase in ("fit", "commit", "fit"):
+        house.pool.phases.enter(phase)
+        house.run(2)
+    found = status.describe(house.pool.situation(), None, 8)
+    assert found["phase"] == "fit"
+    spent_s = found["phases_s"]
+    assert sampled_s > 0
+    assert spent_s["sampling"] == sampled_s
+    assert (spent_s["fit"], spent_s["commit"]) == (pytest.approx(4, abs=0.3), pytest.approx(2, abs=0.3))
+    assert found["durable_for_s"] == pytest.approx(6, abs=0.5)

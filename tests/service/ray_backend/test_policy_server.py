@@ -11,6 +11,7 @@ from house import joining
 
 from t6gps.learner import policy
 from t6gps.service.config import Config
+from t6gps.service.logs import Speaker
 from t6gps.service.pool.attempt import policy_digest
 from t6gps.service.pool.deadlines import TIMINGS
 from t6gps.service.ray_backend import cluster
@@ -24,7 +25,7 @@ UNTRAINED = policy.initial(schema.OBSERVATION_N, CABLES_N, [8], np.random.defaul
 
 
 def test_it_holds_the_newest_policies_and_no_others() -> None:
-    server = PolicyServerActor()
+    server = PolicyServerActor(Speaker())
     for version in range(VERSIONS_HELD_N + 1):
         server.hold(replace(UNTRAINED, version=version))
     for version in range(1, VERSIONS_HELD_N + 1):

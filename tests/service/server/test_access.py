@@ -21,6 +21,7 @@ from t6gps.storage.errors import ServerError
 
 NOW = datetime(2026, 1, 1, tzinfo=UTC)
 NEEDS = {
+    ("GET", "/metrics"): Scope.READ,
     ("GET", "/v1/runs"): Scope.READ,
     ("GET", "/v1/runs/{name}/status"): Scope.READ,
     ("GET", "/v1/runs/{name}/metrics"): Scope.READ,

@@ -62,17 +62,16 @@ def test_a_fetch_that_is_cut_off_again_and_again_goes_on_where_it_was(server: Se
     assert any(each.startswith("bytes=") for each in way.ranges)
 
 
-def test_a_run_at_work_is_not_fetched_but_its_policy_is_at_hand(server: Server, tmp_path: Path) -> None:
-    newest = server.run.checkpoints / "iteration-000002"
-    newest.mkdir()
-    (newest / "arrays.npz").write_bytes(b"arrays")
+def test_a_run_at_work_is_not_fetched_but_its_world_is_at_hand(server: Server, tmp_path: Path) -> None:
+    server.run.ground.mkdir()
+    (server.run.ground / "hill.npy").write_bytes(b"heights")
     with server.client(Scope.READ) as client, catalog.locked(server.run):
         with pytest.raises(RunError, match="in use by process"):
             fetch.fetch(FarSource(client, "walk"), tmp_path, "walk", no_progress)
         with at_hand(client, "walk") as run:
             kept = {str(path.relative_to(run.path)) for path in run.path.rglob("*") if path.is_file()}
             assert run.config_path.read_bytes() == server.run.config_path.read_bytes()
-    assert kept == {"config.json", "checkpoints/iteration-000002/arrays.npz"}
+    assert kept == {"config.json", "ground/hill.npy"}
     assert not run.path.exists()
 
 

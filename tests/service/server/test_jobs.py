@@ -12,7 +12,7 @@ import tiny_run
 from command import t6gps
 from loopback import listening
 
-from t6gps.service.api import policy
+from t6gps.service.api.policy import Policy
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
 from t6gps.service.launch.job import JobState
@@ -21,6 +21,7 @@ from t6gps.service.remote.client import Client
 from t6gps.service.remote.messages import Scope, TokenRequest
 from t6gps.service.server import app, tokens
 from t6gps.service.server.guard import utc_now
+from t6gps.service.training import policies
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
@@ -75,7 +76,7 @@ def test_a_run_is_started_steered_stopped_and_resumed_from_afar(
     assert [(job.run, job.state) for job in client.jobs()] == [("far", JobState.DONE)]
     assert client.evaluation("far") is not None
     assert tables.read(run, "episodes").num_rows == 40
-    assert client.versions("far") == [1]
+    assert client.versions("far") == [0, 1]
     assert client.figures("far") == ["ground_track.png", "learning.png", "segments.png"]
 
 
@@ -139,5 +140,5 @@ def test_a_policy_from_afar_acts_as_the_one_here(tiny: tiny_run.Trained, tmp_pat
         assert client.evaluation("tiny") is not None
         with pytest.raises(Exception, match="no policy of version"):
             client.policy("tiny", 99)
-    here = policy.load(tiny.run, version)
+    here = Policy(policies.load(tiny.run, version))
     assert (there(observation) == here(observation)).all()

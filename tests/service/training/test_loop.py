@@ -74,7 +74,7 @@ def config(tiny: Trained) -> Config:
 @pytest.fixture(scope="module")
 def whole(tiny: Trained) -> dict[str, str]:
     """Digests of an uninterrupted run, without its evaluation."""
-    return {part: digest for part, digest in tiny.digests.items() if part != "evaluation"}
+    return {part: digest for part, digest in tiny.digests.items() if not part.startswith("evaluation")}
 
 
 @pytest.mark.parametrize("stop", [{"episodes": 0}, {"episodes": 4}, *({"phase": phase} for phase in PHASES_BY_NAME)])

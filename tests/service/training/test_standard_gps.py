@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import itertools
+
 import numpy as np
 import pyarrow as pa
 import pytest
@@ -92,11 +94,14 @@ def test_every_direction_is_a_class_and_every_time_step_a_model(
         learner.add(frames, 0.15)
     for phase in PHASES:
         list(getattr(learner, phase.name)())
-    report, classes = learner.report()
+    report, classes, models = learner.report()
     assert report["segments"] == 12
     assert [(row["entry_edge"], row["segments"], row["time_steps"]) for row in classes] == [
         (direction, 12 // DIRECTIONS, STEPS) for direction in range(DIRECTIONS)
     ]
+    assert set(zip(models["bin"].to_pylist(), models["step"].to_pylist(), strict=True)) == set(
+        itertools.product(range(DIRECTIONS), range(STEPS))
+    )
 
 
 def test_standard_gps_without_a_common_start_is_refused() -> None:

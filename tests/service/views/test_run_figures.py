@@ -14,7 +14,9 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Circle
 
 from t6gps.service.views import run_figures
-from t6gps.storage import catalog, schema, tables
+from t6gps.storage import catalog, fields, schema
+from t6gps.storage.delta import iterations
+from t6gps.storage.records import Learned
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
 from t6gps.workers.robot.topology import DELTA, FACES
@@ -24,7 +26,7 @@ from t6gps.workers.settings import HALF_DIAMETER_M, RolloutSettings, TaskSetting
 def _table(name: str, rows: list[dict[str, Any]]) -> pa.Table:
     """Rows of a table, zero where nothing is given."""
     zero = {
-        f.name: [0.0] * (schema.vector_length(f) or 0) if pa.types.is_list(f.type) else None if f.nullable else 0
+        f.name: [0.0] * (fields.vector_length(f) or 0) if pa.types.is_list(f.type) else None if f.nullable else 0
         for f in schema.TABLES[name]
     }
     zero |= {f.name: "completed" for f in schema.TABLES[name] if f.type == pa.string()}
@@ -145,7 +147,7 @@ def test_figures_show_the_last_iteration_and_are_written_whole(tmp_path: Path, m
         row = _table("iterations", [{"iteration": iteration}]).to_pylist()[0]
         classes = _table("classes", [{"iteration": iteration, "segments": 3}]).to_pylist()
         episodes = [_sound(make_episode(iteration, iteration), iteration)]
-        tables.commit_iteration(run, iteration, episodes, row, classes)
+        iterations.commit(run, iteration, episodes, Learned(row, classes, schema.MODELS.empty_table(), []))
     drawn = run_figures.draw(run, RolloutSettings())
     assert drawn == [run.figures / f"{name}.png" for name in ("learning", "ground_track", "segments")]
     assert sorted(run.figures.iterdir()) == sorted(drawn)

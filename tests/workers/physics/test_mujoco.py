@@ -325,7 +325,7 @@ def test_export_writes_the_chosen_robot_and_ground(tmp_path: Path) -> None:
 
 
 def test_eval_runs_on_the_second_engine(tiny: Trained) -> None:
-    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--json", "--root", tiny.run.path.parent)
+    arguments = ("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--json", "--root", tiny.run.path.parent)
     bullet = json.loads(t6gps(*arguments).stdout)
     second = json.loads(t6gps(*arguments, "--engine", "mujoco").stdout)
     assert bullet.keys() == second.keys()

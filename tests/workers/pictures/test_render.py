@@ -10,7 +10,7 @@ import pyarrow as pa
 import pytest
 from PIL import Image
 
-from t6gps.storage import schema
+from t6gps.storage import fields, schema
 from t6gps.storage.errors import ConfigError
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.pictures import scene
@@ -28,7 +28,7 @@ def _frames(rows: int, terrain: Terrain | None = None) -> pa.Table:
     state = neutral_state(RobotSettings())
     columns = {field.name: [0] * rows for field in schema.FRAMES}
     for field in schema.FRAMES:
-        if length := schema.vector_length(field):
+        if length := fields.vector_length(field):
             columns[field.name] = [[0.0] * length] * rows
     ground = 0.0 if terrain is None else float(terrain.heights.max())
     shift = [np.array([0.05 * row, 0.0, ground]) for row in range(rows)]

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
@@ -11,6 +12,19 @@ import pyarrow.dataset as ds
 import pyarrow.parquet as pq
 
 from t6gps.storage import durable, schema
+
+_VERIFIED = ds.ParquetFileFormat(
+    default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
+)
+"""Pages carry a CRC-32, which every reading checks; those of older files have none."""
+
+
+@dataclass(frozen=True)
+class Files:
+    """Files of a table; with `iterations_n` those rows alone that earlier iterations have left."""
+
+    paths: list[str]
+    iterations_n: int | None = None
 
 
 def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None:
@@ -26,6 +40,7 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
             definition,
             compression="zstd",
             compression_level=3,
+            write_page_checksum=True,
             use_dictionary=[field.name for field in definition if field not in floats],
             use_byte_stream_split=[
                 f"{field.name}.list.element" if pa.types.is_list(field.type) else field.name for field in floats
@@ -41,18 +56,28 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
 
 def holds(file: Path, groups: Iterable[pa.Table]) -> bool:
     """True when the row groups of `file` are these tables."""
-    with pq.ParquetFile(file) as found:
+    with pq.ParquetFile(file, page_checksum_verification=True) as found:
         known = iter(range(found.num_row_groups))
         same = all((number := next(known, None)) is not None and found.read_row_group(number).equals(g) for g in groups)
         return same and next(known, None) is None
 
 
-def rows(table: str, files: Sequence[str], iterations_n: int) -> ds.Dataset:
-    """The rows of the first `iterations_n` iterations in `files`, lazily, typed as in `schema.TABLES`."""
+def rows(table: str, files: Files) -> ds.Dataset:
+    """The rows of files, lazily, typed as in `schema.TABLES`."""
     definition = schema.TABLES[table]
-    if not files:
+    if not files.paths:
         return ds.dataset(definition.empty_table())
-    return ds.dataset(list(files), definition, format="parquet").filter(pc.field("iteration") < iterations_n)
+    found = ds.dataset(files.paths, definition, format=_VERIFIED)
+    if files.iterations_n is None:
+        return found
+    seen = pc.field("iteration") < files.iterations_n
+    return found.filter(seen | pc.field("iteration").is_null() if definition.field("iteration").nullable else seen)
+
+
+def version(file: str) -> int:
+    """The schema version of a file's rows, 0 where another program wrote it. OSError or ArrowException without one."""
+    found = pq.read_schema(file).metadata or {}
+    return int(found.get(b"t6gps_schema_version", b"0"))
 
 
 def _leaf(kind: pa.DataType) -> pa.DataType:

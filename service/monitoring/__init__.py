@@ -1,0 +1,1 @@
+"""What the runs of a root measure, for Prometheus (docs/observability.md)."""

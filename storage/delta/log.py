@@ -1,0 +1,132 @@
+"""A Delta table of a run: files with numbers in turn, each made part of the table by one commit to its log."""
+
+from __future__ import annotations
+
+import json
+import time
+from collections.abc import Iterable, Iterator
+from contextlib import contextmanager
+
+import pyarrow as pa
+import pyarrow.compute as pc
+from deltalake import DeltaTable, Schema
+from deltalake.exceptions import DeltaError
+from deltalake.transaction import AddAction, CommitProperties, PostCommitHookProperties, Transaction
+
+from t6gps.storage import durable, schema
+from t6gps.storage.catalog import Run
+from t6gps.storage.delta import parquet
+from t6gps.storage.errors import DataError
+
+MESSAGE_LENGTH_N = 300
+"""Characters of a library's message that are repeated; it may add where in its own code it stopped."""
+
+IDENTITIES = {"iteration", "episode_id", "evaluation_id", "version"}
+"""Columns whose ranges the log has, so that readers of Delta tables skip files."""
+
+_APPLICATION = "t6gps"
+"""Application id of the Delta transactions; their version is the number of the file."""
+
+
+def opened(run: Run, table: str) -> DeltaTable | None:
+    """A table by its log, None before the first commit. DataError where the log is damaged."""
+    location = str(run.tables / table)
+    with readable(run, table):
+        return DeltaTable(location) if DeltaTable.is_deltatable(location) else None
+
+
+def committed(delta: DeltaTable | None) -> int:
+    """How many files have been committed, also by another version of the table: the next has this number."""
+    version = None if delta is None else delta.transaction_version(_APPLICATION)
+    return 0 if version is None else version + 1
+
+
+def files(run: Run, table: str, delta: DeltaTable) -> list[str]:
+    """The table's files by name. DataError where one is missing or has another size than its commit says."""
+    with readable(run, table):
+        actions = pa.table(delta.get_add_actions(flatten=True)).select(["path", "size_bytes"]).sort_by("path")
+        sizes = {run.tables / table / row["path"]: row["size_bytes"] for row in actions.to_pylist()}
+        for file, size in sizes.items():
+            if not file.is_file() or file.stat().st_size != size:
+                found = f"{file.stat().st_size}" if file.is_file() else "none"
+                raise damaged(run, table, f"{file.name} has {size} bytes, found {found}")
+    return [str(file) for file in sizes]
+
+
+def add(run: Run, table: str, number: int, stem: str, groups: Iterable[pa.Table]) -> None:
+    """Write the file STEM-NUMBER.parquet and commit it, unless a file of that number is committed already.
+
+    DataError where that one holds other rows, in a table that is large enough to be committed in groups.
+    """
+    folder = run.tables / table
+    file = folder / f"{stem}-{number:06d}.parquet"
+    delta = opened(run, table)
+    if delta is not None and number < committed(delta):
+        if table == "frames" and not parquet.holds(file, groups):
+            raise DataError(
+                f"{file} holds other episodes than those to be committed: the spool of iteration {number} "
+                "was changed after the crash; restore it, or continue in a new run"
+            )
+        return
+    statistics = _Statistics()
+    folder.mkdir(exist_ok=True)
+    parquet.write(file, schema.TABLES[table], map(statistics.seen, groups))
+    definition = Schema.from_arrow(schema.TABLES[table])
+    delta = delta or DeltaTable.create(str(folder), definition)
+    delta.create_write_transaction(
+        [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
+        "append",
+        definition,
+        commit_properties=CommitProperties(app_transactions=[Transaction(_APPLICATION, number)]),
+        # Checkpoints of the log are not forced to disk by the library; a run's log is short enough without.
+        post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
+    )
+    log = folder / "_delta_log"
+    for entry in sorted(log.glob("*.json"))[-2:]:  # the commit, and the table's creation before the first
+        durable.sync(entry)
+    for parent in (log, folder, run.tables):
+        durable.sync(parent)
+
+
+@contextmanager
+def readable(run: Run, table: str) -> Iterator[None]:
+    """What libraries say of a table that they cannot read becomes a DataError."""
+    try:
+        yield
+    except (DeltaError, pa.ArrowException, OSError) as error:
+        lines = str(error).splitlines() or [type(error).__name__]
+        raise damaged(run, table, lines[0][:MESSAGE_LENGTH_N]) from error
+
+
+def damaged(run: Run, table: str, what: str) -> DataError:
+    """The error for a table that is not whole."""
+    return DataError(
+        f"run {run.name} is not whole: table {table} in {run.tables / table} cannot be read: {what}; "
+        "restore the run from a copy"
+    )
+
+
+class _Statistics:
+    """What Delta readers need to skip a file: its number of rows and the range of its identities."""
+
+    def __init__(self) -> None:
+        self._rows_n = 0
+        self._least: dict[str, int] = {}
+        self._most: dict[str, int] = {}
+
+    def seen(self, group: pa.Table) -> pa.Table:
+        """Count the rows of a row group, and hand it on."""
+        self._rows_n += group.num_rows
+        for name in IDENTITIES.intersection(group.column_names) if group.num_rows else ():
+            ends = pc.min_max(group.column(name)).as_py()
+            if ends["min"] is not None:
+                self._least[name] = min(ends["min"], self._least.get(name, ends["min"]))
+                self._most[name] = max(ends["max"], self._most.get(name, ends["max"]))
+        return group
+
+    def to_json(self) -> str:
+        """As the Delta protocol has it."""
+        return json.dumps(
+            {"numRecords": self._rows_n, "minValues": self._least, "maxValues": self._most, "nullCount": {}},
+            sort_keys=True,
+        )
