@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -69,6 +70,7 @@ def _started(folder: Folder) -> str:
             )
     except FileNotFoundError as error:
         raise RunError(f"cannot start a job on this machine: no {error.filename}; install bash") from None
+    threading.Thread(target=process.wait, daemon=True).start()  # a server that lives longer leaves no zombie
     return f"{socket.gethostname()}:{process.pid}:{processes.started(process.pid)}"
 
 
