@@ -53,6 +53,11 @@ bench-libraries: install
 fuzz: install
 	$(BIN)/python tests/workers/ground/fuzz.py 2000
 
+# A hundred requests for each route of the server, within what its own document allows and as many beyond it.
+.PHONY: api
+api: install
+	T6GPS_API_EXAMPLES=100 $(BIN)/pytest tests/service/server/test_document.py
+
 # Twenty kills, a learner that pauses for a minute, and half an hour of workers killed, stopped and scaled at random;
 # the figures are printed at the end.
 soak: install

@@ -96,11 +96,16 @@ def load(source: str, overrides: Sequence[str] = ()) -> Config:
             f"unknown preset '{source}'{_nearest(source, presets())}; "
             f"allowed: {', '.join(presets())}, or the path of a file that ends in .toml"
         )
+    return from_toml(text, overrides, source)
+
+
+def from_toml(text: str, overrides: Sequence[str], where: str) -> Config:
+    """The configuration that the text of a file makes, with overrides. ConfigError as for `load`."""
     try:
         values = tomllib.loads(text)
     except tomllib.TOMLDecodeError as error:
-        raise ConfigError(f"{source} is not TOML: {error}; correct the file") from None
-    return _checked_learner(_with_whole_paths(_validated(_overridden(values, overrides), source)), source)
+        raise ConfigError(f"{where} is not TOML: {error}; correct the file") from None
+    return _checked_learner(_with_whole_paths(_validated(_overridden(values, overrides), where)), where)
 
 
 def kept(run: Run, overrides: Sequence[str] = ()) -> Config:

@@ -12,6 +12,7 @@ from pathlib import Path
 import httpx
 import uvicorn
 
+from t6gps.service.config import Config
 from t6gps.service.remote.client import Client
 from t6gps.service.remote.messages import Scope
 from t6gps.service.server import serving
@@ -41,9 +42,9 @@ class Server:
     def now(self) -> datetime:
         return datetime.now(UTC) + self.later
 
-    def launch(self, run: Run) -> int:
+    def launch(self, run: Run, _: Config) -> str:
         self.launched.append(run.name)
-        return 1
+        return run.name
 
     def http(self, scope: Scope | None = None) -> httpx.Client:
         """A bare client, with the token of a scope or none."""

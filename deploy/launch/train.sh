@@ -6,6 +6,7 @@
 folder=$1
 root=${folder%/.jobs/*}
 rm -f "$folder/exit_code"
+unset T6GPS_SERVER # the run is trained here
 
 t6gps train "$folder/config.toml" --run "${folder##*/}" --root "$root" --resume < /dev/null &
 train=$!

@@ -18,14 +18,15 @@ BENCHMARKS = {
     "physics": "t6gps.workers.bench.physics",
     "pool": "t6gps.service.bench.pool",
     "scale": "t6gps.service.bench.scale",
+    "server": "t6gps.service.bench.server",
     "soundness": "t6gps.workers.bench.soundness",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
-SIZED = ("pool",)
+SIZED = ("pool", "server")
 """Benchmarks that can be told how long and how often to measure."""
-LONG = ("learner", "pool", "scale")
+LONG = ("learner", "pool", "scale", "server")
 """Benchmarks that say how far they are."""
 
 

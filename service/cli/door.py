@@ -1,24 +1,24 @@
-"""What commands ask of runs, the same for a root of this machine and for a server."""
+"""What commands ask of runs, the same for a root of this machine (`here`) and for a server (`far`)."""
 
 from __future__ import annotations
 
-from collections.abc import Iterator
-from contextlib import contextmanager
-from dataclasses import dataclass
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import AbstractContextManager, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, BinaryIO, Protocol, final
+from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import pyarrow as pa
 
-from t6gps.service.steering import requests
-from t6gps.service.steering import status as statuses
+from t6gps.service.cli.here import Here
+from t6gps.service.launch.control import JobLine, Standing
+from t6gps.service.launch.fetch import Source
+from t6gps.service.steering.events import Event
 from t6gps.service.steering.status import Status
-from t6gps.service.training import evaluation, origin, summary
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import RunSummary
-from t6gps.storage import catalog, tables
-from t6gps.storage.errors import ConfigError, RunError
-from t6gps.storage.sql import query
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError
+from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.storage.sql.query import Head
 
 if TYPE_CHECKING:
@@ -26,15 +26,33 @@ if TYPE_CHECKING:
 
 
 class Door(Protocol):
-    """A root's runs, by their names. Errors are those of the functions behind it."""
+    """A root's runs, by their names or those of their jobs. Errors are those of the functions behind it."""
 
     def runs(self) -> list[RunSummary]: ...
 
-    def status(self, name: str) -> Status: ...
+    def standing(self, name: str) -> Standing: ...
 
     def scale(self, name: str, workers: int, deadline_s: float) -> Status: ...
 
+    def pause(self, name: str, deadline_s: float) -> Status: ...
+
+    def unpause(self, name: str, deadline_s: float) -> Status: ...
+
+    def stop(self, name: str, deadline_s: float, warn: Callable[[str], object]) -> str: ...
+
+    def history(self, name: str) -> Sequence[Event]: ...
+
+    def follow(self, name: str) -> Iterator[Event]: ...
+
+    def jobs(self) -> list[JobLine]: ...
+
+    def logs(self, name: str, follow: bool) -> Iterator[str]: ...
+
     def table(self, name: str, table: str) -> pa.Table: ...
+
+    def episode(self, name: str, number: int, evaluation: int | None) -> Episode: ...
+
+    def policy(self, name: str, version: int | None) -> PolicySnapshot: ...
 
     def evaluation(self, name: str) -> Evaluation | None: ...
 
@@ -42,58 +60,21 @@ class Door(Protocol):
 
     def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None: ...
 
+    def source(self, name: str) -> AbstractContextManager[tuple[Source, str]]: ...
 
-@final
-@dataclass(frozen=True)
-class Local:
-    """Runs below a root of this machine."""
-
-    root: Path
-
-    def runs(self) -> list[RunSummary]:
-        """All runs by name. RunError where there is no such root."""
-        if not catalog.whole(self.root).is_dir():
-            raise RunError(
-                f"there is no folder {self.root} that could hold runs; train a first one, or give another --root"
-            )
-        return [summary.summary(run) for run in catalog.list_runs(self.root)]
-
-    def status(self, name: str) -> Status:
-        """How a run is."""
-        return statuses.status(catalog.open_run(self.root, name))
-
-    def scale(self, name: str, workers: int, deadline_s: float) -> Status:
-        """Give a running run so many workers; its status then."""
-        return requests.scale(catalog.open_run(self.root, name), workers, deadline_s)
-
-    def table(self, name: str, table: str) -> pa.Table:
-        """A table. An error for a run that is not whole."""
-        run = catalog.open_run(self.root, name)
-        origin.configured(run)
-        tables.files(run)
-        return tables.read(run, table)
-
-    def evaluation(self, name: str) -> Evaluation | None:
-        """What the last policy did without noise; None before the training has ended."""
-        return evaluation.kept(catalog.open_run(self.root, name))
-
-    def head(self, name: str, sql: str) -> Head:
-        """The first rows of the result of one SELECT."""
-        return query.head(catalog.open_run(self.root, name), sql)
-
-    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
-        """Write the result of one SELECT as arrow, csv or json."""
-        query.write(catalog.open_run(self.root, name), sql, form, sink)
+    def at_hand(self, name: str) -> AbstractContextManager[Run]: ...
 
 
 @contextmanager
 def opened(root: Path, server: str | None) -> Iterator[Door]:
     """The door to the runs below `root`, or to those of a server. ConfigError where its client is not installed."""
     if server is None:
-        yield Local(root)
+        yield Here(root)
         return
     with connected(server) as client:
-        yield client
+        from t6gps.service.cli.far import Far
+
+        yield Far(client)
 
 
 @contextmanager

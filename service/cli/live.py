@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import sys
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -10,16 +11,12 @@ from typing import Annotated
 import typer
 
 from t6gps.service.cli import door
-from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName, Server
-from t6gps.service.launch import job as records
-from t6gps.service.launch import launchers
+from t6gps.service.cli.options import DEFAULT_ROOT, INTERRUPTED, JobName, Json, Root, RunName, Server
 from t6gps.service.pool import crash_bundle
 from t6gps.service.pool.attempt import Failure
-from t6gps.service.steering import events as happened
 from t6gps.service.steering import requests
 from t6gps.service.steering.status import Status
 from t6gps.service.views import terminal
-from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 
 Deadline = Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for that (s).")]
@@ -37,7 +34,7 @@ WORKER_COLUMNS = {
 def add_to(app: typer.Typer) -> None:
     """Make the commands part of `t6gps`."""
     app.command(context_settings={"ignore_unknown_options": True})(scale)  # so that -1 is a number, and refused as one
-    for command in (pause, unpause, status, events, replay):
+    for command in (pause, unpause, stop, status, events, replay):
         app.command()(command)
 
 
@@ -49,51 +46,67 @@ def scale(
     deadline_s: Deadline = requests.SCALE_DEADLINE_S,
 ) -> None:
     """Grow or shrink a running run; its data stay the same."""
-    job = None if server else records.find(root, run_name)
-    if job is None:
-        with door.opened(root, server) as runs:
-            reached = runs.scale(run_name, workers, deadline_s)
-    else:
-        reached = launchers.serving(job).scale(job, workers, deadline_s)
-    _tell_reached(run_name, reached)
+    with door.opened(root, server) as there:
+        _tell_reached(run_name, there.scale(run_name, workers, deadline_s))
 
 
-def pause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+def pause(
+    run_name: RunName,
+    root: Root = DEFAULT_ROOT,
+    server: Server = None,
+    deadline_s: Deadline = requests.SCALE_DEADLINE_S,
+) -> None:
     """Give a running run no workers for now; `unpause` gives it what it had."""
-    _tell_reached(run_name, requests.pause(catalog.open_run(root, run_name), deadline_s))
+    with door.opened(root, server) as there:
+        _tell_reached(run_name, there.pause(run_name, deadline_s))
 
 
-def unpause(run_name: RunName, root: Root = DEFAULT_ROOT, deadline_s: Deadline = requests.SCALE_DEADLINE_S) -> None:
+def unpause(
+    run_name: RunName,
+    root: Root = DEFAULT_ROOT,
+    server: Server = None,
+    deadline_s: Deadline = requests.SCALE_DEADLINE_S,
+) -> None:
     """Give a paused run the workers, or the autoscaling, that it had."""
-    _tell_reached(run_name, requests.unpause(catalog.open_run(root, run_name), deadline_s))
+    with door.opened(root, server) as there:
+        _tell_reached(run_name, there.unpause(run_name, deadline_s))
 
 
 def _tell_reached(run_name: str, reached: Status) -> None:
     typer.echo(f"run {run_name} has {reached['ready']} workers ({reached['state']})")
 
 
-def status(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
+def stop(
+    name: JobName,
+    root: Root = DEFAULT_ROOT,
+    server: Server = None,
+    deadline_s: Annotated[float, typer.Option("--deadline", min=0.0, help="How long to wait for it (s).")] = (
+        requests.STOP_DEADLINE_S
+    ),
+) -> None:
+    """Stop a run as Ctrl-C does, and end the job that does not stop. Everything sampled is kept."""
+    with door.opened(root, server) as there:
+        typer.echo(there.stop(name, deadline_s, terminal.warn))
+
+
+def status(name: JobName, root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
     """Say how a run is: its workers, what is under way, who waits for whom and since when."""
-    job = None if server else records.find(root, run_name)
-    if job is None:
-        with door.opened(root, server) as runs:
-            _print_status(run_name, runs.status(run_name), as_json)
-        return
-    launcher = launchers.serving(job)
-    known, (state, detail) = launcher.status(job), launcher.state(job)
+    with door.opened(root, server) as there:
+        standing = there.standing(name)
+    job, known = standing.job, standing.status
     if as_json:
-        typer.echo(json.dumps({"job": {"name": job.name, "state": state, "detail": detail}, **(known or {})}))
+        said = {} if job is None else {"job": {"name": job.name, "state": job.state, "detail": job.detail}}
+        typer.echo(json.dumps({**said, **(known or {})}))
         return
-    typer.echo(f"job {job.name} on {job.kind} ({job.native_id}): {state}" + (f", {detail}" if detail else ""))
+    if job is not None:
+        detail = f", {job.detail}" if job.detail else ""
+        typer.echo(f"job {job.name} on {job.kind} ({job.native_id}): {job.state}{detail}")
     if known is not None:
-        _print_status(job.run, known, as_json)
+        _print_status(name if job is None else job.run, known)
 
 
-def _print_status(run_name: str, state: Status, as_json: bool) -> None:
-    """Print how a run is, in lines and a table of its workers, or as JSON."""
-    if as_json:
-        typer.echo(json.dumps(state))
-        return
+def _print_status(run_name: str, state: Status) -> None:
+    """Print how a run is, in lines and a table of its workers."""
     counts = {**state["episodes"], **state["processes"]}
     waits = [f"{wait['what']} since {wait['for_s']:.1f} s" for wait in state["waits"]]
     lines = [
@@ -110,14 +123,25 @@ def _print_status(run_name: str, state: Status, as_json: bool) -> None:
         terminal.print_rows("Workers", [dict(worker) for worker in state["workers"]], WORKER_COLUMNS)
 
 
-def events(run_name: RunName, root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+def events(
+    run_name: RunName,
+    root: Root = DEFAULT_ROOT,
+    server: Server = None,
+    follow: Annotated[bool, typer.Option("--follow", "-f", help="Go on with what happens, until Ctrl-C.")] = False,
+    as_json: Annotated[bool, typer.Option("--json", help="Print one JSON object, with -f one a line.")] = False,
+) -> None:
     """Say what happened to a run: starts, scaling, failures, replacements, each with its reason."""
-    found = happened.read(catalog.open_run(root, run_name))
-    if as_json:
-        typer.echo(json.dumps({"events": found}))
-        return
-    for event in found:
-        typer.echo(f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}")
+    with door.opened(root, server) as there:
+        if as_json and not follow:
+            typer.echo(json.dumps({"events": there.history(run_name)}))
+            return
+        try:
+            for event in there.follow(run_name) if follow else there.history(run_name):
+                line = f"{event['time']}  {event['event']:<11}  {event['phase']}: {event['reason']}"
+                typer.echo(json.dumps(event) if as_json else line)
+                sys.stdout.flush()
+        except KeyboardInterrupt:  # of the watching; the run goes on
+            raise typer.Exit(INTERRUPTED) from None
 
 
 def replay(

@@ -19,7 +19,7 @@ import typer
 from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import care, doctor, launching, live, serving, stored
+from t6gps.service.cli import care, doctor, door, launching, live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -38,7 +38,6 @@ from t6gps.service.studies.declared import Scale
 from t6gps.service.training import origin, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
-from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import T6GpsError
 
@@ -147,6 +146,7 @@ def study(
 def evaluate(
     run_name: RunName,
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     episodes: Annotated[int, typer.Option(min=2, help="Noise-free episodes.")] = 40,
     seed: Annotated[int, typer.Option(min=0, help="Seed of starts and waypoints; never one of training.")] = 1,
     terrain_seed: Annotated[int | None, typer.Option(min=0, help="Seed of the ground alone.")] = None,
@@ -160,13 +160,14 @@ def evaluate(
     engine: Annotated[Engine, typer.Option(help="mujoco cross-checks, as with --serial.")] = Engine.BULLET,
     as_json: Json = False,
 ) -> None:
-    """Evaluate a run's policy without noise on unseen seeds, and keep the episodes."""
-    run = catalog.open_run(root, run_name)
-    logs.become(Role.SUPERVISOR, run.name)
-    config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
-    asked = session.Asked(episodes, seed, terrain_seed, version, keep=not no_keep)
-    with terminal.ProgressDisplay(config.run.iterations) as display:
-        result, number = session.evaluate(run, config, asked, serial, engine, display)
+    """Evaluate a run's policy without noise on unseen seeds, and keep the episodes, but not for a server's run."""
+    logs.become(Role.SUPERVISOR, run_name)
+    with door.opened(root, server) as there, there.at_hand(run_name) as run:
+        config = session.evaluation_config(run, with_workers(overrides, workers), terminal.warn)
+        policy = there.policy(run_name, version)
+        asked = session.Asked(episodes, seed, terrain_seed, policy.version, keep=server is None and not no_keep)
+        with terminal.ProgressDisplay(config.run.iterations) as display:
+            result, number = session.evaluate(run, config, asked, serial, engine, display, policy)
     if as_json:
         typer.echo(result.to_json())
     else:
@@ -179,8 +180,12 @@ def evaluate(
 def bench(
     name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
     root: Root = DEFAULT_ROOT,
-    seconds: Annotated[float | None, typer.Option(help="pool: seconds of each measurement; 30 by default.")] = None,
-    rounds: Annotated[int | None, typer.Option(help="pool: measurements of each contender; 5 by default.")] = None,
+    seconds: Annotated[
+        float | None, typer.Option(help="pool, server: seconds of each measurement; 30 by default.")
+    ] = None,
+    rounds: Annotated[
+        int | None, typer.Option(help="pool, server: measurements of each contender; 5 by default.")
+    ] = None,
     as_json: Json = False,
 ) -> None:
     """Measure speed, each figure beside a reference of the same run."""

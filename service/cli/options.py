@@ -10,6 +10,8 @@ import typer
 from t6gps.storage.errors import ConfigError
 
 DEFAULT_ROOT = Path("runs")
+INTERRUPTED = 130
+"""The exit code of a command that Ctrl-C has ended."""
 
 Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
 Server = Annotated[
@@ -17,6 +19,7 @@ Server = Annotated[
     typer.Option("--server", metavar="URL", envvar="T6GPS_SERVER", help="A server (t6gps serve) in place of --root."),
 ]
 RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see `t6gps runs`).")]
+JobName = Annotated[str, typer.Argument(metavar="JOB|RUN", help="Name of a job (see `t6gps jobs`), or of its run.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")

@@ -12,7 +12,7 @@ import typer
 from t6gps.service import config as configuration
 from t6gps.service import logs
 from t6gps.service.cli import door
-from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root
+from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, Server
 from t6gps.service.logs import Role
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
@@ -61,18 +61,17 @@ def serve(
 
 
 def train_there(
-    server: str, preset: str, run_name: str | None, overrides: list[str], serial: bool, resume: bool
+    server: str, source: str, run_name: str | None, overrides: list[str], serial: bool, resume: bool
 ) -> None:
-    """Let a server train a run, or resume one, and say how to follow it. ConfigError for what only works here."""
+    """Let a server train a run, or go on with one, and say how to follow it. ConfigError for what only works here."""
     if serial:
         raise ConfigError("--serial computes in this process, which a server cannot; leave out --serial or --server")
     with door.connected(server) as client:
-        if resume:
-            started = client.resume(preset if run_name is None else run_name)
-        else:
-            started = client.start(preset, run_name, dict(map(configuration.assigned, overrides)))
-    typer.echo(f"run {started.name} is at work in process {started.pid} of the server")
-    terminal.say(f"follow it with: t6gps status {started.name} --server {server}")
+        started = client.start(source, run_name, dict(map(configuration.assigned, overrides)), resume)
+    for warning in started.warnings:
+        terminal.warn(warning)
+    typer.echo(f"run {started.name} is at work on the server")
+    terminal.say(f"follow it with: t6gps logs -f {started.name} --server {server}")
 
 
 @token.command()
@@ -81,6 +80,7 @@ def create(
     scope: Annotated[str, typer.Option(help="read, operate (runs as well), or admin (tokens as well).")] = "read",
     days: Annotated[float, typer.Option(help="It expires after so many days, at most 366.")] = 30.0,
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
 ) -> None:
     """Create a token and print it; it is shown once and kept nowhere."""
     from pydantic import ValidationError
@@ -93,27 +93,40 @@ def create(
     except ValidationError as error:
         faults = "; ".join(f"{fault['loc'][0]}: {fault['msg']}, found {fault['input']!r}" for fault in error.errors())
         raise ConfigError(f"no such token can be: {faults}; correct it") from None
-    typer.echo(tokens.issue(catalog.whole(root), request, datetime.now(UTC)).token)
+    if server is None:
+        issued = tokens.issue(catalog.whole(root), request, datetime.now(UTC))
+    else:
+        with door.connected(server) as client:
+            issued = client.admin.create_token(request.name, request.scope, request.days)
+    typer.echo(issued.token)
 
 
 @token.command(name="list")
-def list_(root: Root = DEFAULT_ROOT, as_json: Json = False) -> None:
+def list_(root: Root = DEFAULT_ROOT, server: Server = None, as_json: Json = False) -> None:
     """List the tokens, without what is secret of them."""
     from t6gps.service.server import tokens
 
-    lines = tokens.listed(catalog.whole(root))
+    if server is None:
+        lines = tokens.listed(catalog.whole(root))
+    else:
+        with door.connected(server) as client:
+            lines = client.admin.tokens()
     if as_json:
         typer.echo(json.dumps({"tokens": [line.model_dump(mode="json") for line in lines]}))
         return
     now = datetime.now(UTC)
     rows = [line.model_dump() | {"state": "expired" if line.expires <= now else "valid"} for line in lines]
-    terminal.print_rows(f"Tokens of {root}", rows, TOKEN_COLUMNS)
+    terminal.print_rows(f"Tokens of {root if server is None else server}", rows, TOKEN_COLUMNS)
 
 
 @token.command()
-def revoke(name: TokenName, root: Root = DEFAULT_ROOT) -> None:
+def revoke(name: TokenName, root: Root = DEFAULT_ROOT, server: Server = None) -> None:
     """Refuse a token from now on."""
     from t6gps.service.server import tokens
 
-    tokens.revoke(catalog.whole(root), name)
+    if server is None:
+        tokens.revoke(catalog.whole(root), name)
+    else:
+        with door.connected(server) as client:
+            client.admin.revoke_token(name)
     typer.echo(f"token {name} is revoked")

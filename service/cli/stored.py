@@ -114,6 +114,7 @@ def render(
     episode: Annotated[int, typer.Argument(min=0, help="Episode id (see the table `episodes`).")],
     out: Annotated[Path, typer.Option("--out", help="FILE.png or FILE.mp4.")],
     root: Root = DEFAULT_ROOT,
+    server: Server = None,
     evaluation_id: Annotated[
         int | None, typer.Option("--evaluation", min=0, help="Evaluation that the episode is of.")
     ] = None,
@@ -125,15 +126,17 @@ def render(
     from t6gps.workers.pictures import render as rendering
     from t6gps.workers.pictures.scene import Sizes
 
-    run = catalog.open_run(root, run_name)
-    config = origin.configured(run) if evaluation_id is None else evaluation_records.world(run, evaluation_id)
-    stored = tables.episode(run, episode, evaluation_id)
-    row = stored.summary.to_pylist()[0]
-    session.tell_changes(run, terminal.warn)
-    terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
-    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
-    with terminal.task("rendering") as progress:
-        rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
+    if server is not None and evaluation_id is not None:
+        raise ConfigError("--evaluation draws from a run of this machine; bring it here with t6gps fetch")
+    with door.opened(root, server) as there, there.at_hand(run_name) as run:
+        config = origin.configured(run) if evaluation_id is None else evaluation_records.world(run, evaluation_id)
+        stored = there.episode(run_name, episode, evaluation_id)
+        row = stored.summary.to_pylist()[0]
+        session.tell_changes(run, terminal.warn)
+        terrain = ground(config.terrain, row["terrain_seed"], row["terrain_difficulty"])
+        sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+        with terminal.task("rendering") as progress:
+            rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)
 
 

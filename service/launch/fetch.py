@@ -54,6 +54,13 @@ class FolderSource:
         names = {path.relative_to(self.run.path): path for path in paths}
         return {str(name): described(path) for name, path in names.items() if not name.parts[0].startswith(".")}
 
+    def essentials(self) -> dict[str, File]:
+        """Those that say in which world a policy acts: configuration, origin and ground; also of a run at work."""
+        run = self.run
+        ground = sorted(run.ground.iterdir()) if run.ground.is_dir() else []
+        paths = [path for path in (run.config_path, run.path / "origin.json", *ground) if path.is_file()]
+        return {str(path.relative_to(run.path)): described(path) for path in paths}
+
     def pieces(self, path: str, offset: int) -> Iterator[bytes]:
         with (self.run.path / path).open("rb") as file:
             file.seek(offset)
@@ -81,7 +88,7 @@ def fetch(source: Source, root: Path, name: str, progress: Callable[[int, int], 
         _remove_others(draft, files)
         for done, (file, expected) in enumerate(files.items()):
             progress(done, len(files))
-            _fetched(source, draft, file, expected)
+            bring(source, draft, file, expected)
         progress(len(files), len(files))
         if source.files() != files:
             raise RunError(f"run {name} has changed while it was fetched; fetch it again when nobody uses it")
@@ -98,9 +105,9 @@ def fetch(source: Source, root: Path, name: str, progress: Callable[[int, int], 
     return Run(path)
 
 
-def _fetched(source: Source, draft: Path, file: str, expected: File) -> None:
-    """Have a file in the draft that is verified; continue one that was cut off. RunError where it comes altered."""
-    path = draft / file
+def bring(source: Source, folder: Path, file: str, expected: File) -> None:
+    """Have a file in a folder that is verified; continue one that was cut off. RunError where it comes altered."""
+    path = folder / file
     path.parent.mkdir(parents=True, exist_ok=True)
     for _ in range(ATTEMPTS_N):
         there = path.stat().st_size if path.exists() else 0

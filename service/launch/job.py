@@ -154,12 +154,20 @@ def _records() -> Iterator[Job]:
             raise RunError(f"cannot read the record {path} of a job: {reason}; correct or remove the file") from None
 
 
+def of_root(root: Path) -> list[Job]:
+    """The jobs that train runs of a root, the newest last."""
+    whole = catalog.whole(root)
+    return [job for job in jobs() if Path(job.root) == whole]
+
+
+def training(root: Path, run: str) -> Job | None:
+    """The job that trains a run of a root, None where there is none."""
+    return next((job for job in of_root(root) if job.run == run), None)
+
+
 def find(root: Path, name: str) -> Job | None:
     """The job that trains the run `name` of a root; else, where that root has no such run, the job of that name."""
-    whole, known = catalog.whole(root), jobs()
-    for job in known:
-        if job.run == name and Path(job.root) == whole:
-            return job
-    if catalog.exists(root, name):
-        return None
-    return next((job for job in known if job.name == name), None)
+    job = training(root, name)
+    if job is not None or catalog.exists(root, name):
+        return job
+    return next((job for job in jobs() if job.name == name), None)

@@ -7,16 +7,18 @@ from contextlib import ExitStack
 from pathlib import Path
 
 from t6gps.service import config as configuration
+from t6gps.service.config import Config
 from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch import launchers
 from t6gps.service.launch.folder import Folder, Planned
-from t6gps.service.launch.job import ENDED, Job, JobState
+from t6gps.service.launch.job import ENDED, Job
 from t6gps.service.launch.launcher import Launcher
 from t6gps.service.launch.target import Kind, Target
 from t6gps.service.training import session
 from t6gps.storage import catalog
-from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 
 
 def plan(
@@ -40,6 +42,13 @@ def plan(
     folders.check_ground(planned[0].config)
     for job in planned:
         _check_free(job, resume)
+    return planned
+
+
+def continuing(run: Run, config: Config) -> Planned:
+    """The job that trains what is missing of a run. RunError where somebody trains it already."""
+    planned = Planned(config, folders.of(run.path.parent, run.name))
+    _check_ended(planned.folder)
     return planned
 
 
@@ -86,22 +95,8 @@ def _check_ended(folder: Folder) -> None:
     job = records.find(folder.root, folder.run)
     if job is None:
         return
-    state, detail = state_of(job)
+    state, detail = launchers.serving(job).state(job)
     if state not in ENDED:
         raise RunError(
             f"job {job.name} is {state} ({detail}); wait for it to end, or end it with t6gps stop {job.name}"
         )
-
-
-def state_of(job: Job) -> tuple[JobState, str]:
-    """How a job is. RunError where its target cannot be asked."""
-    return launchers.serving(job).state(job)
-
-
-def named(root: Path, name: str) -> Job:
-    """The job of a name, or that of a run of that name. ConfigError that names the jobs there are."""
-    job = records.find(root, name)
-    if job is None:
-        known = ", ".join(other.name for other in records.jobs()) or "none; submit one with t6gps submit"
-        raise ConfigError(f"there is no job {name!r}; jobs: {known}")
-    return job

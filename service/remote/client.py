@@ -8,6 +8,7 @@ from __future__ import annotations
 import io
 import os
 from collections.abc import Iterator, Mapping
+from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, final
 from urllib.parse import quote
@@ -17,23 +18,26 @@ import numpy as np
 import pyarrow as pa
 from pydantic import JsonValue
 
+from t6gps.service import config as configuration
 from t6gps.service.api.policy import Policy
+from t6gps.service.launch.control import JobLine, Standing
+from t6gps.service.launch.fetch import File
+from t6gps.service.remote.administration import Administration
 from t6gps.service.remote.connection import Connection, checked
 from t6gps.service.remote.messages import (
-    AuditLine,
     Health,
-    IssuedToken,
     QueryForm,
     QueryRequest,
     ScaleRequest,
-    Scope,
     Started,
     StartRequest,
-    TokenLine,
-    TokenRequest,
+    Stopped,
+    StopRequest,
+    WaitRequest,
 )
-from t6gps.service.remote.stream import Update
-from t6gps.service.steering.requests import SCALE_DEADLINE_S
+from t6gps.service.remote.stream import START, Update
+from t6gps.service.steering.events import Event
+from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.service.steering.status import Status
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
@@ -51,6 +55,7 @@ class Client:
     def __init__(self, url: str, token: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         token = os.environ.get(TOKEN_VARIABLE, "") if token is None else token
         self._server = Connection(url, token.strip(), transport)
+        self.admin = Administration(self._server)
 
     def __enter__(self) -> Client:
         return self
@@ -72,31 +77,62 @@ class Client:
         """All runs by name, damaged ones included."""
         return self._server.get("/runs", list[RunSummary])
 
-    def start(self, preset: str, name: str | None = None, settings: Mapping[str, JsonValue] | None = None) -> Started:
-        """Start a run of a preset on the server's machine; its process."""
-        request = checked(StartRequest, preset=preset, name=name, settings=dict(settings or {}))
-        return self._server.post("/runs", Started, request)
+    def start(
+        self,
+        source: str,
+        name: str | None = None,
+        settings: Mapping[str, JsonValue] | None = None,
+        resume: bool = False,
+    ) -> Started:
+        """Let the server train a run of a preset, or of a TOML file of this machine; its job.
+
+        resume   go on with the run of that name, with the same settings; start it where it is not there yet
+        """
+        known = source in configuration.presets()
+        text = {"preset": source} if known else {"toml": configuration.load(source).to_toml()}
+        more = {"default_name": Path(source).stem, "settings": dict(settings or {}), "resume": resume}
+        return self._server.post("/runs", Started, checked(StartRequest, **text, name=name, **more))
 
     def status(self, name: str) -> Status:
         """How a run is."""
         return self._server.get(f"{_run(name)}/status", Status)
+
+    def standing(self, name: str) -> Standing:
+        """How a run is, and the job that trains it."""
+        return self._server.get(f"{_run(name)}/standing", Standing)
+
+    def jobs(self) -> list[JobLine]:
+        """The jobs that train runs of the server."""
+        return self._server.get("/jobs", list[JobLine])
+
+    def log(self, name: str, after: int) -> bytes:
+        """What the job of a run has written after so many bytes, a piece; nothing where that is all so far."""
+        return self._server.ask("GET", f"{_run(name)}/logs?after={after}")
+
+    def history(self, name: str) -> list[Event]:
+        """What happened to a run's workers and episodes, each with its reason."""
+        return self._server.get(f"{_run(name)}/history", list[Event])
 
     def scale(self, name: str, workers: int, deadline_s: float = SCALE_DEADLINE_S) -> Status:
         """Give a running run so many workers, and wait until it has them; its status then."""
         request = checked(ScaleRequest, workers=workers, deadline_s=deadline_s)
         return self._server.post(f"{_run(name)}/scale", Status, request)
 
-    def pause(self, name: str) -> Status:
+    def pause(self, name: str, deadline_s: float = SCALE_DEADLINE_S) -> Status:
         """Take all workers from a running run; its status then."""
-        return self._server.post(f"{_run(name)}/pause", Status)
+        return self._server.post(f"{_run(name)}/pause", Status, checked(WaitRequest, deadline_s=deadline_s))
+
+    def unpause(self, name: str, deadline_s: float = SCALE_DEADLINE_S) -> Status:
+        """Give a paused run what it had; its status then."""
+        return self._server.post(f"{_run(name)}/unpause", Status, checked(WaitRequest, deadline_s=deadline_s))
 
     def resume(self, name: str) -> Started:
-        """Give a paused run its workers, or a stopped run a process."""
+        """Give a paused run its workers, or let a job train what is missing of a stopped run."""
         return self._server.post(f"{_run(name)}/resume", Started)
 
-    def stop(self, name: str) -> None:
+    def stop(self, name: str, deadline_s: float = STOP_DEADLINE_S) -> Stopped:
         """Stop a run, and wait until it has ended; everything sampled is kept."""
-        self._server.ask("POST", f"{_run(name)}/stop")
+        return self._server.post(f"{_run(name)}/stop", Stopped, checked(StopRequest, deadline_s=deadline_s))
 
     def metrics(self, name: str) -> list[Row]:
         """Rows of the table `iterations`."""
@@ -122,10 +158,7 @@ class Client:
         """A policy that acts here."""
         content = self._server.ask("GET", f"{_run(name)}/policies/{int(version)}")
         try:
-            with np.load(io.BytesIO(content), allow_pickle=False) as arrays:
-                layers_n = sum(key.startswith("weight_") for key in arrays.files)
-                layers = tuple((arrays[f"weight_{k}"], arrays[f"bias_{k}"]) for k in range(layers_n))
-                return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
+            return _policy(content, version)
         except (ValueError, KeyError, OSError) as error:
             raise self._server.nonsense(error) from None
 
@@ -133,10 +166,11 @@ class Client:
         """The result of one SELECT."""
         sink = io.BytesIO()
         self.write(name, sql, QueryForm.ARROW, sink)
-        try:
-            return pa.ipc.open_stream(sink.getbuffer()).read_all()
-        except pa.ArrowException as error:
-            raise self._server.nonsense(error) from None
+        return self._server.table(sink.getvalue())
+
+    def episode(self, name: str, number: int) -> pa.Table:
+        """The frames of an episode, bit for bit."""
+        return self._server.table(self._server.ask("GET", f"{_run(name)}/episodes/{int(number)}"))
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""
@@ -152,25 +186,24 @@ class Client:
         """The first rows of the result of one SELECT, as texts for people."""
         return self._server.post(f"{_run(name)}/query", Head, checked(QueryRequest, sql=sql, form=QueryForm.HEAD))
 
-    def events(self, name: str, last: int = -1) -> Iterator[Update]:
-        """What happens to a run after the iteration `last`, until the connection ends. ServerError then."""
+    def events(self, name: str, last: str = START) -> Iterator[Update]:
+        """What happens to a run after the update whose id is `last`, until the connection ends. ServerError then."""
         return self._server.events(f"{_run(name)}/events", last)
 
-    def tokens(self) -> list[TokenLine]:
-        """All tokens."""
-        return self._server.get("/tokens", list[TokenLine])
+    def files(self, name: str, whole: bool = True) -> dict[str, File]:
+        """The files of a run that nobody trains, by their paths in it; or else only those of its world."""
+        return self._server.get(f"{_run(name)}/files?whole={str(whole).lower()}", dict[str, File])
 
-    def create_token(self, name: str, scope: Scope, days: float) -> IssuedToken:
-        """A new token."""
-        return self._server.post("/tokens", IssuedToken, checked(TokenRequest, name=name, scope=scope, days=days))
+    def pieces(self, name: str, path: str, offset: int = 0) -> Iterator[bytes]:
+        """The content of a file of a run from a byte on, as it comes."""
+        return self._server.pieces(f"{_run(name)}/file?path={quote(path, safe='')}", offset)
 
-    def revoke_token(self, name: str) -> None:
-        """Refuse a token from now on."""
-        self._server.ask("DELETE", f"/tokens/{quote(name, safe='')}")
 
-    def audit(self) -> list[AuditLine]:
-        """The newest changes that somebody asked for."""
-        return self._server.get("/audit", list[AuditLine])
+def _policy(archive: bytes, version: int) -> Policy:
+    with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
+        layers_n = sum(key.startswith("weight_") for key in arrays.files)
+        layers = tuple((arrays[f"weight_{k}"], arrays[f"bias_{k}"]) for k in range(layers_n))
+        return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
 
 
 def _run(name: str) -> str:

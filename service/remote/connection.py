@@ -12,6 +12,7 @@ from contextlib import contextmanager
 from typing import TypeVar, final
 
 import httpx
+import pyarrow as pa
 from pydantic import BaseModel, JsonValue, TypeAdapter, ValidationError
 
 from t6gps.service.remote.messages import WAIT_S, Refusal
@@ -31,10 +32,14 @@ KINDS: dict[str, type[T6GpsError]] = {
     kind.__name__: kind for kind in (ConfigError, RunError, DataError, CheckpointError, QueryError, TerrainError)
 }
 """Errors that a server may tell, by their names; any other is a ServerError."""
-ANSWER_S, CONNECT_S = 2 * WAIT_S, 10.0
+ANSWER_S, CONNECT_S = 3 * WAIT_S, 10.0
 """A server that says nothing for so long is said to be silent."""
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
+
+
+class UnreachableError(ServerError):
+    """A server that cannot be reached, or with which the connection has broken."""
 
 
 @final
@@ -80,9 +85,14 @@ class Connection:
         with self._streamed("POST", path, json=request.model_dump(mode="json")) as answer:
             yield from answer.iter_bytes()
 
-    def events(self, path: str, last: int) -> Iterator[Update]:
+    def pieces(self, path: str, offset: int) -> Iterator[bytes]:
+        """What is there from a byte on, as it comes."""
+        with self._streamed("GET", path, headers={"Range": f"bytes={offset}-"} if offset else None) as answer:
+            yield from answer.iter_bytes()
+
+    def events(self, path: str, last: str) -> Iterator[Update]:
         """Events of a stream after `last`, until the server ends it. ServerError where the connection breaks."""
-        with self._streamed("GET", path, headers={"Last-Event-ID": str(last)}) as answer:
+        with self._streamed("GET", path, headers={"Last-Event-ID": last}) as answer:
             yield from parsed(answer.iter_lines())
 
     @contextmanager
@@ -98,15 +108,22 @@ class Connection:
         except httpx.HTTPError as error:
             raise self._unreachable(error) from None
 
+    def table(self, stream: bytes) -> pa.Table:
+        """The table of an IPC stream that was answered."""
+        try:
+            return pa.ipc.open_stream(stream).read_all()
+        except pa.ArrowException as error:
+            raise self.nonsense(error) from None
+
     def nonsense(self, error: Exception) -> ServerError:
         """The error for an answer that cannot be understood."""
         line = str(error).splitlines()[0]
         return ServerError(f"server {self.url} answers what is not understood here ({line}); use the same t6gps as it")
 
-    def _unreachable(self, error: httpx.HTTPError) -> ServerError:
+    def _unreachable(self, error: httpx.HTTPError) -> UnreachableError:
         if isinstance(error, httpx.ReadTimeout):
-            return ServerError(f"server {self.url} has not answered within {ANSWER_S:.0f} s; see its log")
-        return ServerError(
+            return UnreachableError(f"server {self.url} has not answered within {ANSWER_S:.0f} s; see its log")
+        return UnreachableError(
             f"server {self.url} cannot be reached: {error}; correct the address, or start one with t6gps serve"
         )
 

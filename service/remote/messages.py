@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, WithJsonSchema
 
 from t6gps.service.config import WORKERS_MOST_N, presets
+from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.storage.catalog import NAME_LENGTH_N
 from t6gps.storage.sql.query import SQL_BYTES_N
 
@@ -21,6 +22,7 @@ TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r
 Preset = Annotated[str, WithJsonSchema({"type": "string", "enum": presets()})]
 Key = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z_]+(\.[a-z_]+)+$")]
 Number = Annotated[float, Field(allow_inf_nan=False)]
+CursorText = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,9}-[0-9]{1,9}$")]
 Text = Annotated[str, StringConstraints(max_length=200)]
 Scalar = bool | int | Number | Text
 
@@ -58,25 +60,51 @@ class Health(Message):
 
 
 class StartRequest(Message):
-    """A run to start: a preset, the run's name (by default the preset's), settings by dotted keys."""
+    """A run to start: a preset or the text of a file, and settings by dotted keys.
 
-    preset: Preset
+    name           of the run; without one `default_name`, else the preset's, with a number where that is taken
+    resume         go on with the run of that name, which has the same settings, if there is one
+    """
+
+    preset: Preset | None = None
+    toml: Annotated[str, StringConstraints(max_length=20_000)] | None = None
     name: RunName | None = None
+    default_name: RunName | None = None
     settings: dict[Key, Scalar | list[Scalar]] = Field(default={}, max_length=100)
+    resume: bool = False
 
 
 class Started(Message):
-    """The run that a process works on now."""
+    """The run that is at work now; `job` trains it, None where it was only paused. `warnings` for who asked."""
 
     name: str
-    pid: int
+    job: str | None
+    warnings: list[str] = []
 
 
-class ScaleRequest(Message):
+class WaitRequest(Message):
+    """How long to wait for what is asked (s)."""
+
+    deadline_s: Number = Field(SCALE_DEADLINE_S, ge=0.0, le=WAIT_S)
+
+
+class ScaleRequest(WaitRequest):
     """Workers from now on, and how long to wait for them (s)."""
 
     workers: int = Field(ge=0, le=WORKERS_MOST_N)
-    deadline_s: Number = Field(30.0, ge=0.0, le=WAIT_S)
+
+
+class StopRequest(Message):
+    """How long to wait until the run has stopped by itself (s); then its job is ended."""
+
+    deadline_s: Number = Field(STOP_DEADLINE_S, ge=0.0, le=WAIT_S)
+
+
+class Stopped(Message):
+    """How a run that was stopped is then, in words, and what went otherwise than asked."""
+
+    sentence: str
+    warnings: list[str]
 
 
 class QueryForm(StrEnum):

@@ -8,18 +8,22 @@ from dataclasses import dataclass
 
 from pydantic import JsonValue
 
+START = "0-0"
+"""The id of who has been told nothing."""
+
 
 @dataclass(frozen=True)
 class Update:
     """Something that happened to a run.
 
-    kind   iteration, with a row of the table `iterations`; status, with a status; fault, with a sentence
-    id     the iteration's number, after which a stream may be resumed; None for the others
+    kind   iteration, with a row of the table `iterations`; pool, with an event; status, with a status; fault, with a
+           sentence
+    id     where a stream may be resumed, so that each comes once; None for a status and a fault
     """
 
     kind: str
     data: JsonValue
-    id: int | None = None
+    id: str | None = None
 
 
 def parsed(lines: Iterable[str]) -> Iterator[Update]:
@@ -30,6 +34,5 @@ def parsed(lines: Iterable[str]) -> Iterator[Update]:
             name, _, value = line.partition(": ")
             fields[name] = value
         elif not line and "data" in fields:
-            identity = fields.get("id")
-            yield Update(fields["event"], json.loads(fields["data"]), None if identity is None else int(identity))
+            yield Update(fields["event"], json.loads(fields["data"]), fields.get("id"))
             fields = {}

@@ -15,10 +15,10 @@ from starlette.exceptions import HTTPException
 from t6gps.service.monitoring import exporter
 from t6gps.service.monitoring.exporter import Exporter
 from t6gps.service.remote.messages import Health
-from t6gps.service.server import administering, jobs, operating, reading
-from t6gps.service.server.access import REFUSALS, Answers, NoSuchRunError, Reading, Served, Slots
 from t6gps.service.server.guard import Clock, Guard, Limits, refusal, utc_now
-from t6gps.service.server.jobs import Launch
+from t6gps.service.server.launching import Launch, launch
+from t6gps.service.server.routes import administering, jobs, operating, reading, stored
+from t6gps.service.server.routes.access import REFUSALS, Answers, NoSuchRunError, Reading, Served, Slots
 from t6gps.storage.errors import ConfigError, QueryError, RunError, ServerError, T6GpsError
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
@@ -32,21 +32,28 @@ def create(
     root: Path,
     names: frozenset[str] = LOOPBACK,
     scheme: str = "http",
-    launch: Launch = jobs.launch,
+    start: Launch = launch,
     now: Clock = utc_now,
     limits: Limits = DEFAULT_LIMITS,
 ) -> FastAPI:
     """The application for the runs of a root.
 
     names    names of this server that a client may ask for
-    launch   what starts the process of a run
+    start    what lets a job train a run
     now      the time by which tokens expire
     """
     version = metadata.version("t6gps")
     app = FastAPI(title="t6gps", version=version, docs_url=None, redoc_url=None, redirect_slashes=False)
-    app.state.served = Served(root, launch)
+    app.state.served = Served(root, start)
     app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now, limits=limits)
-    for routes in (reading.routes, operating.routes, administering.routes, _monitoring(root)):
+    for routes in (
+        reading.routes,
+        stored.routes,
+        jobs.routes,
+        operating.routes,
+        administering.routes,
+        _monitoring(root),
+    ):
         app.include_router(routes)
 
     @app.get("/v1/health", tags=["read"])

@@ -1,19 +1,22 @@
 """What happened to a run, for people: RUN/pool/events.jsonl, one line an event, each with its reason.
 
-Events follow from what the supervisor observed and decided (`of`). The file goes on when the run is resumed. One of
-LARGEST_BYTES is renamed to `events.1.jsonl`, and a new one begins.
+Events follow from what the supervisor observed and decided (`of`). They are numbered from 0, and the file goes on when
+the run is resumed. One of LARGEST_BYTES is renamed to `events.1.jsonl`, and a new one begins.
 """
 
 from __future__ import annotations
 
 import json
 import os
+import time
 from collections.abc import Iterator, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 from pathlib import Path
-from typing import TypedDict
+
+from typing_extensions import TypedDict  # pydantic cannot check those of `typing` before Python 3.12
 
 from t6gps.service.pool import messages, scaling
 from t6gps.service.pool.messages import Instruction, Observation
@@ -21,7 +24,8 @@ from t6gps.service.pool.state import Ending, PoolState, RunState
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
-LARGEST_BYTES = 2**20
+LARGEST_BYTES, LOOK_S = 2**20, 0.2
+FILE, OLDER = "events.jsonl", "events.1.jsonl"
 
 
 class EventKind(StrEnum):
@@ -75,6 +79,7 @@ class Happened:
 class Event(TypedDict):
     """A line of the file: the time is UTC in ISO 8601, `phase` what the run did."""
 
+    number: int
     time: str
     event: str
     phase: str
@@ -171,41 +176,85 @@ class EventLog:
 
     def __init__(self, folder: Path, largest_bytes: int = LARGEST_BYTES) -> None:
         folder.mkdir(exist_ok=True)
-        self._path, self._largest_bytes = folder / "events.jsonl", largest_bytes
+        self._path, self._largest_bytes = folder / FILE, largest_bytes
         if self._path.exists():  # perhaps the machine went down in the middle of a line
             os.truncate(self._path, self._path.read_bytes().rfind(b"\n") + 1)
+        self._next = _last_number(folder) + 1
 
     def write(self, happened: Sequence[Happened], phase: str) -> None:
         """Add events that happened now. They need not survive a crash of the machine."""
         if not happened:
             return
-        time = datetime.now(UTC).isoformat(timespec="milliseconds")
+        now = datetime.now(UTC).isoformat(timespec="milliseconds")
         events: list[Event] = [
-            {"time": time, "event": each.event, "phase": phase, "reason": each.reason} for each in happened
+            {"number": number, "time": now, "event": each.event, "phase": phase, "reason": each.reason}
+            for number, each in enumerate(happened, self._next)
         ]
+        self._next += len(events)
         lines = "".join(json.dumps(event) + "\n" for event in events)
         if self._path.exists() and self._path.stat().st_size + len(lines) > self._largest_bytes:
-            self._path.replace(self._path.with_suffix(".1.jsonl"))
+            self._path.replace(self._path.with_name(OLDER))
         with self._path.open("a", encoding="ascii") as file:
             file.write(lines)
 
 
 def read(run: Run) -> list[Event]:
     """The events of a run that are kept, the first first; none when it never had workers. RunError when damaged."""
+    return _kept(run.pool)
+
+
+def stamp(run: Run) -> tuple[int, ...]:
+    """What changes whenever `read` gives something new."""
+    try:
+        found = (run.pool / FILE).stat()
+    except OSError:  # `read` says which
+        return ()
+    return found.st_ino, found.st_size
+
+
+def follow(run: Run, look_s: float = LOOK_S) -> Iterator[Event]:
+    """The events of a run that are kept, and those to come, for as long as somebody listens. RunError as `read`."""
+    told, seen = -1, tuple[int, ...]()
+    while True:
+        now = stamp(run)
+        if now != seen:
+            seen = now
+            for event in read(run):
+                if event["number"] > told:
+                    told = event["number"]
+                    yield event
+        time.sleep(look_s)
+
+
+def _kept(folder: Path) -> list[Event]:
     events: list[Event] = []
-    for name in ("events.1.jsonl", "events.jsonl"):
-        path = run.pool / name
-        try:
-            lines = path.read_bytes().splitlines(keepends=True)
-        except FileNotFoundError:
-            continue
-        except OSError as error:
-            raise RunError(f"cannot read {path}: {error.strerror}; get permission to read it") from error
-        for number, line in enumerate(lines, 1):
+    newest_first = [(path, _content(path)) for path in (folder / FILE, folder / OLDER)]  # one may become the other
+    for path, content in reversed(newest_first):
+        for number, line in enumerate(content.splitlines(keepends=True), 1):
             try:
-                events.append(json.loads(line))
-            except ValueError as error:
+                event: Event = json.loads(line)
+                if not events or event["number"] > events[-1]["number"]:
+                    events.append(event)
+            except (ValueError, TypeError, KeyError) as error:
                 if line.endswith(b"\n"):
                     raise RunError(f"{path}: line {number} is no event: {error}; remove the line") from None
                 # else it was being written when the machine went down, or is at this moment
     return events
+
+
+def _content(path: Path) -> bytes:
+    try:
+        return path.read_bytes()
+    except FileNotFoundError:
+        return b""
+    except OSError as error:
+        raise RunError(f"cannot read {path}: {error.strerror}; get permission to read it") from error
+
+
+def _last_number(folder: Path) -> int:
+    """The number of the last event that is whole, -1 where there is none; a damaged line stops no run."""
+    for path in (folder / FILE, folder / OLDER):
+        for line in reversed(path.read_bytes().splitlines() if path.exists() else []):
+            with suppress(ValueError, TypeError, KeyError):
+                return int(json.loads(line)["number"])
+    return -1

@@ -19,14 +19,18 @@ def versions(run: Run) -> list[int]:
     return sorted(_in_table(run) | set(checkpoint.kept(run.checkpoints)))
 
 
+def chosen_of(name: str, kept: list[int], version: int | None) -> int:
+    """The version that is asked for of those that a run keeps, the newest by default. RunError naming them."""
+    if not kept:
+        raise RunError(f"run {name} has no policy yet; let it finish an iteration")
+    if version is not None and version not in kept:
+        raise RunError(f"run {name} keeps no policy of version {version!r}; kept: {', '.join(map(str, kept))}")
+    return kept[-1] if version is None else version
+
+
 def load(run: Run, version: int | None) -> PolicySnapshot:
     """The policy of a version, the newest by default. RunError naming the versions that are kept."""
-    kept = versions(run)
-    if not kept:
-        raise RunError(f"run {run.name} has no policy yet; let it finish an iteration")
-    chosen = kept[-1] if version is None else version
-    if chosen not in kept:
-        raise RunError(f"run {run.name} keeps no policy of version {version!r}; kept: {', '.join(map(str, kept))}")
+    chosen = chosen_of(run.name, versions(run), version)
     if chosen in _in_table(run):
         return tables.policy(run, chosen)
     _, manifest, arrays = checkpoint.load(checkpoint.kept(run.checkpoints)[chosen])

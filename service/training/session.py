@@ -174,13 +174,19 @@ class Asked:
 
 
 def evaluate(
-    run: Run, config: Config, asked: Asked, serial: bool, engine: Engine, observer: Observer
+    run: Run,
+    config: Config,
+    asked: Asked,
+    serial: bool,
+    engine: Engine,
+    observer: Observer,
+    policy: PolicySnapshot | None = None,
 ) -> tuple[Evaluation, int | None]:
     """Evaluate a policy in the world of a configuration; the result, and its number where it is kept.
 
     RunError for a policy that the run does not keep, and before its first one.
     """
-    policy = policies.load(run, asked.version)
+    policy = policy or policies.load(run, asked.version)
     with closing(start_executor(config, serial, engine=engine)) as executor:
         if asked.keep:
             occasion = Occasion(Purpose.EVAL, terrain_seed=asked.terrain_seed, engine=engine.value)

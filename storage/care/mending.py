@@ -59,7 +59,7 @@ def tables_from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: It
 
     Single files did not help, so tables contradict each other, and none says which of them is right.
     """
-    sentences, spoilt = [], {fault.part for fault in unsound}
+    sentences, spoilt = list[str](), {fault.part for fault in unsound}
     if not any(fault.part in schema.TABLES for fault in faults):
         return sentences
     for table in (name for name in schema.TABLES if name not in spoilt and (copy.tables / name).exists()):

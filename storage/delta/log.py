@@ -121,7 +121,7 @@ def damaged(run: Run, table: str, what: str) -> DataError:
     """The error for a table that is not whole."""
     return DataError(
         f"run {run.name} is not whole: table {table} in {run.tables / table} cannot be read: {what}; "
-        "restore the run from a copy: t6gps repair {run.name} --from COPY"
+        f"restore the run from a copy: t6gps repair {run.name} --from COPY"
     )
 
 

@@ -71,7 +71,7 @@ def test_a_job_stops_cleanly_and_leaves_no_process(tmp_path: Path, wait_until: W
     assert t6gps("scale", "a", "1", "--root", root).stdout.decode().startswith("run a has 1 workers")
     members = family(job)
     assert len(members) > 3
-    assert "is stopped; resume" in t6gps("stop", "a", "--root", root).stdout.decode()
+    assert "is stopped; --resume continues it" in t6gps("stop", "a", "--root", root).stdout.decode()
     wait_until(lambda: not any(processes.started(pid) for pid in members), 30.0)
     assert "everything sampled so far is kept" in t6gps("logs", "a", "--root", root).stdout.decode()
     assert "there is nothing to stop" in t6gps("stop", "a", "--root", root, code=2).stderr.replace("\n", " ")

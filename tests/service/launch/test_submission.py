@@ -219,11 +219,12 @@ def test_a_state_folder_that_cannot_be_made_is_refused_before_anything_is(
     assert not (tmp_path / "runs").exists()
 
 
-@pytest.mark.parametrize("command", ["logs", "stop"])
-def test_a_name_of_no_job_is_refused_with_the_jobs_there_are(command: str, tmp_path: Path) -> None:
-    assert "there is no job 'nothing'; jobs: none" in t6gps(
-        command, "nothing", "--root", tmp_path, code=2
-    ).stderr.replace("\n", " ")
+@pytest.mark.parametrize(
+    ("command", "words"),
+    [("logs", "there is no job 'nothing'; jobs: none"), ("stop", "there is no run 'nothing'")],
+)
+def test_a_name_of_nothing_is_refused_with_what_there_is(command: str, words: str, tmp_path: Path) -> None:
+    assert words in t6gps(command, "nothing", "--root", tmp_path, code=2).stderr.replace("\n", " ")
 
 
 def test_outcomes_are_those_of_the_exit_code(tmp_path: Path) -> None:

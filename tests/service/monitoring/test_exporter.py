@@ -18,9 +18,10 @@ from t6gps.service import config as configuration
 from t6gps.service.monitoring.exporter import Exporter
 from t6gps.service.monitoring.metrics import METRICS, Kind
 from t6gps.service.steering import status
-from t6gps.storage import catalog, schema, tables
+from t6gps.storage import catalog, schema
 from t6gps.storage.catalog import Run
-from t6gps.storage.records import Episode
+from t6gps.storage.delta import iterations
+from t6gps.storage.records import Episode, Learned
 from t6gps.storage.spool import Spool
 
 Numbers = dict[tuple[str, ...], float]
@@ -62,7 +63,7 @@ def root(tmp_path: Path, make_episode: Callable[..., Episode]) -> Path:
     """A root with the run `walk`: one iteration is committed, an episode is spooled, and a bundle is kept."""
     run = create(tmp_path / "runs", "walk")
     row = dict.fromkeys(schema.ITERATIONS.names, 0) | ROW
-    tables.commit_iteration(run, 0, iter([make_episode(0, 0)]), row, [])
+    iterations.commit(run, 0, iter([make_episode(0, 0)]), Learned(row, [], schema.MODELS.empty_table(), []))
     Spool(run.spool, 1).append(make_episode(1, 1))
     run.bundles.mkdir()
     (run.bundles / "episode-5.json").write_text("{}")

@@ -20,8 +20,11 @@ from t6gps.storage.records import Episode
 
 
 @pytest.fixture
-def serve(tmp_path: Path, make_episode: Callable[..., Episode]) -> Iterator[Callable[..., Server]]:
+def serve(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, make_episode: Callable[..., Episode]
+) -> Iterator[Callable[..., Server]]:
     """serve(limits, stalled_s) starts a server of a root with the run `walk`, which has committed two iterations."""
+    monkeypatch.setenv("T6GPS_STATE", str(tmp_path / "state"))
     with ExitStack() as stack:
 
         def start(limits: Limits = PATIENT, stalled_s: float = STALLED_S) -> Server:
@@ -32,7 +35,7 @@ def serve(tmp_path: Path, make_episode: Callable[..., Episode]) -> Iterator[Call
             now = datetime.now(UTC)
             texts = {scope: tokens.issue(run.path.parent, asked, now).token for scope, asked in requests.items()}
             server = Server("", run, texts)
-            application = app.create(server.root, launch=server.launch, now=server.now, limits=limits)
+            application = app.create(server.root, start=server.launch, now=server.now, limits=limits)
             server.url = stack.enter_context(listening(application, stalled_s))
             return server
 

@@ -32,9 +32,17 @@ NEEDS = {
     ("GET", "/v1/runs/{name}/policies/{version}"): Scope.READ,
     ("POST", "/v1/runs/{name}/query"): Scope.READ,
     ("GET", "/v1/runs/{name}/events"): Scope.READ,
+    ("GET", "/v1/runs/{name}/standing"): Scope.READ,
+    ("GET", "/v1/runs/{name}/logs"): Scope.READ,
+    ("GET", "/v1/runs/{name}/history"): Scope.READ,
+    ("GET", "/v1/runs/{name}/episodes/{number}"): Scope.READ,
+    ("GET", "/v1/runs/{name}/files"): Scope.READ,
+    ("GET", "/v1/runs/{name}/file"): Scope.READ,
+    ("GET", "/v1/jobs"): Scope.READ,
     ("POST", "/v1/runs"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/scale"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/pause"): Scope.OPERATE,
+    ("POST", "/v1/runs/{name}/unpause"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/resume"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/stop"): Scope.OPERATE,
     ("GET", "/v1/tokens"): Scope.ADMIN,
@@ -48,7 +56,7 @@ REFUSED = (401, 403)
 
 def status_of(http: httpx.Client, method: str, path: str) -> int:
     """The status of a request for a run that does not exist, so that nothing changes."""
-    with http.stream(method, path.format(name="none", figure="none.png", version=0, token="none")) as answer:
+    with http.stream(method, path.format(name="none", figure="none.png", version=0, number=0, token="none")) as answer:
         return answer.status_code
 
 
@@ -72,7 +80,7 @@ def test_a_scope_opens_its_routes_and_those_of_lower_scopes_alone(server: Server
 def test_an_expired_or_revoked_token_opens_nothing(server: Server) -> None:
     with server.http(Scope.READ) as http, server.client(Scope.ADMIN) as admin:
         assert http.get("/v1/runs").status_code == 200
-        admin.revoke_token("read")
+        admin.admin.revoke_token("read")
         assert http.get("/v1/runs").status_code == 401
     server.later = timedelta(days=2)
     with server.http(Scope.ADMIN) as http:
@@ -202,8 +210,8 @@ def test_each_change_has_a_line_in_the_audit_made_or_refused_and_reading_has_non
         for refused in (lambda: reader.pause("walk"), lambda: operator.stop("walk"), lambda: operator.pause("none")):
             with pytest.raises(Exception, match=r"scope|not running|no run"):
                 refused()
-        issued = admin.create_token("short", Scope.READ, 0.5)
-        lines = admin.audit()
+        issued = admin.admin.create_token("short", Scope.READ, 0.5)
+        lines = admin.admin.audit()
     assert [(line.token, line.method, line.path, line.status) for line in lines] == [
         ("operate", "POST", "/v1/runs", 202),
         ("read", "POST", "/v1/runs/walk/pause", 403),

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import os
+
 import pytest
 import schemathesis
 from hypothesis import HealthCheck, Phase, assume, given, settings
@@ -15,8 +17,8 @@ ENDLESS = "/v1/runs/{name}/events"
 """A stream has no end; its tests are in test_updates.py."""
 BEYOND = [schemathesis.checks.positive_data_acceptance]
 """Not asked: which settings and which SQL there are is beyond what a document can say."""
-EXAMPLES_N = 8
-"""Of each route, within what its document allows and beyond it."""
+EXAMPLES_N = int(os.environ.get("T6GPS_API_EXAMPLES", "8"))
+"""Of each route, within what its document allows and beyond it; `make api` asks for more."""
 
 
 @pytest.mark.slow
@@ -44,6 +46,6 @@ def test_whatever_is_asked_is_answered_as_the_document_says(server: Server, mode
                 case.path_parameters["name"] = server.run.name  # else every route says that there is no such run
             head = case.meta.components.get(ParameterLocation.HEADER)
             assume(head is None or head.mode is GenerationMode.POSITIVE)  # tokens are tested in test_access.py
-            case.call_and_validate(headers=headers, excluded_checks=BEYOND)
+            case.call_and_validate(headers=headers, excluded_checks=BEYOND, timeout=120)
 
         answered()

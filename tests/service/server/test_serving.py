@@ -133,31 +133,6 @@ def test_tokens_are_listed_without_their_secrets_and_revoked_by_name(tmp_path: P
     assert "no token 'me'" in t6gps("token", "revoke", "me", "--root", tmp_path, code=2).stderr
 
 
-def test_commands_say_the_same_of_a_server_as_of_its_root(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setenv("T6GPS_TOKEN", server.tokens[Scope.READ])
-    sql = "SELECT iteration, count(*) AS n FROM episodes GROUP BY iteration ORDER BY iteration"
-    for arguments in (["query", "walk", sql, "--format", "json"], ["query", "walk", sql, "--format", "csv"]):
-        there = t6gps(*arguments, "--server", server.url)
-        assert there.stdout == t6gps(*arguments, "--root", server.root).stdout
-    rows = [t6gps("runs", *place).stdout.decode().partition("┏")[2] for place in places(server)]
-    assert rows[0] == rows[1]
-    shown = [t6gps("show", "walk", *place).stdout.decode().partition("dataset")[0] for place in places(server)]
-    assert shown[0] == shown[1]
-    assert "Diagnosis" in shown[0]
-    for arguments in (
-        ["status", "walk"],
-        ["show", "none"],
-        ["query", "walk", "SELEC"],
-        ["query", "walk", "SELECT x"],
-    ):
-        refusals = [t6gps(*arguments, *place, code=2).stderr for place in places(server)]
-        assert refusals[0] == refusals[1]
-
-
-def places(server: Server) -> tuple[list[str], list[str]]:
-    return ["--server", server.url], ["--root", str(server.root)]
-
-
 @pytest.mark.parametrize(
     ("url", "token", "words"),
     [
@@ -182,7 +157,7 @@ def test_a_token_of_another_server_is_one_error(server: Server, monkeypatch: pyt
 
 
 def test_a_server_is_told_to_train_with_the_settings_of_the_command(
-    server: Server, monkeypatch: pytest.MonkeyPatch
+    server: Server, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:
     monkeypatch.setenv("T6GPS_TOKEN", server.tokens[Scope.OPERATE])
     settings = ["--set", "run.iterations=2", "--set=task.directions=36", "--workers", "3"]
@@ -190,13 +165,16 @@ def test_a_server_is_told_to_train_with_the_settings_of_the_command(
     assert "far" in said
     config = configuration.kept(catalog.open_run(server.root, "far"))
     assert (config.run.iterations, config.run.workers, config.task.directions) == (2, 3, 36)
-    t6gps("train", "walk", "--resume", "--server", server.url)
+    t6gps("train", "flat-quick", "--run", "walk", "--resume", "--server", server.url)
+    changed = ["train", "flat-quick", "--run", "walk", "--resume", "--set", "run.seed=9", "--server", server.url]
+    assert "run.seed = 9 (the run has 0)" in t6gps(*changed, code=2).stderr
     assert server.launched == ["far", "walk"]
-    for refused, words in ((["flat-quick", "--serial"], "--serial"), (["mine.toml"], "unknown preset")):
+    mine = tmp_path / "mine.toml"
+    mine.write_text(configuration.load("rough", ["run.seed=5"]).to_toml())
+    t6gps("train", mine, "--set", "run.iterations=2", "--server", server.url)
+    t6gps("train", mine, "--server", server.url)
+    assert catalog.exists(server.root, "mine-2")
+    sent = configuration.kept(catalog.open_run(server.root, "mine"))
+    assert sent == configuration.load("rough", ["run.seed=5", "run.iterations=2"])
+    for refused, words in ((["flat-quick", "--serial"], "--serial"), (["none.toml"], "cannot read")):
         assert words in t6gps("train", *refused, "--server", server.url, code=2).stderr
-
-
-def test_scaling_over_a_server_needs_its_scope(server: Server, monkeypatch: pytest.MonkeyPatch) -> None:
-    for scope, words in ((Scope.READ, "needs operate"), (Scope.OPERATE, "never run with workers")):
-        monkeypatch.setenv("T6GPS_TOKEN", server.tokens[scope])
-        assert words in t6gps("scale", "walk", "2", "--server", server.url, code=2).stderr

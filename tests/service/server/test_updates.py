@@ -1,41 +1,107 @@
-"""Laws of live updates: each iteration comes once, also to who was cut off, and dead listeners hold up nobody."""
+"""Laws of live updates: each comes once, also to who was cut off, and dead listeners hold up nobody."""
 
 from __future__ import annotations
 
 import socket
-from collections.abc import Callable
+from collections.abc import Callable, Iterable, Iterator
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
 
+import httpx
 import pytest
 from loopback import Server, commit
 
+from t6gps.service.remote import following
+from t6gps.service.remote.client import Client
+from t6gps.service.remote.connection import UnreachableError
 from t6gps.service.remote.messages import Scope
-from t6gps.service.remote.stream import Update, parsed
-from t6gps.service.server.access import STREAMS_N
+from t6gps.service.remote.stream import START, Update, parsed
+from t6gps.service.server.routes.access import STREAMS_N
+from t6gps.service.steering.events import EventKind, EventLog, Happened
 from t6gps.storage.errors import RunError, ServerError
 from t6gps.storage.records import Episode
 
 
-def ids(updates: list[Update]) -> list[int | None]:
-    return [update.id for update in updates]
+def test_who_was_cut_off_goes_on_after_the_last_id_and_hears_everything_once(
+    server: Server, make_episode: Callable[..., Episode]
+) -> None:
+    log = EventLog(server.run.pool, largest_bytes=2000)
+    log.write([Happened(EventKind.START, "0")], "sampling")
+    heard: list[Update] = []
+
+    def hear(number: int) -> None:
+        """Connect, take so many updates, and be cut off."""
+        heard.extend(islice(client.events("walk", heard[-1].id if heard else START), number))
+
+    with server.client(Scope.READ) as client:
+        hear(1)
+        hear(2)
+        commit(server.run, 2, make_episode)
+        hear(1)
+        for number in range(1, 40):  # more than a file takes
+            log.write([Happened(EventKind.HANG, str(number))], "sampling")
+            if number % 10 == 9:
+                hear(10 if number > 9 else 9)
+        commit(server.run, 3, make_episode)
+        hear(1)
+    rows = [update.data for update in heard if update.kind == "iteration"]
+    assert [row["cost"] for row in rows] == [0.5, 1.5, 2.5, 3.5]
+    told = [update.data for update in heard if update.kind == "pool"]
+    assert [event["reason"] for event in told] == [str(number) for number in range(40)]
+    assert len({update.id for update in heard}) == len(heard) == 44
 
 
-def test_who_was_cut_off_goes_on_after_the_last_id_and_hears_each_iteration_once(
+class Breaking(httpx.BaseTransport):
+    """A way to a server on which every stream of events breaks after its first event."""
+
+    def __init__(self) -> None:
+        self.way, self.ids = httpx.HTTPTransport(), list[str]()
+
+    def handle_request(self, request: httpx.Request) -> httpx.Response:
+        answer = self.way.handle_request(request)
+        self.ids.append(request.headers["Last-Event-ID"])
+        return httpx.Response(answer.status_code, headers=answer.headers, stream=Cut(answer.stream))
+
+
+class Cut(httpx.SyncByteStream):
+    def __init__(self, whole: Iterable[bytes]) -> None:
+        self.whole = whole
+
+    def __iter__(self) -> Iterator[bytes]:
+        for piece in self.whole:
+            yield piece
+            if b"event:" in piece:
+                raise httpx.ReadError("the connection is cut")
+
+
+def test_who_keeps_listening_hears_each_once_over_connections_that_break(server: Server) -> None:
+    log = EventLog(server.run.pool)
+    for number in range(3):
+        log.write([Happened(EventKind.HANG, str(number))], "sampling")
+    way = Breaking()
+    with Client(server.url, server.tokens[Scope.READ], transport=way) as client:
+        heard = list(islice(following.updates(client, "walk", look_s=0.01), 5))
+    assert [update.id for update in heard] == ["0-1", "0-2", "0-3", "1-3", "2-3"]
+    assert way.ids == [START, "0-1", "0-2", "0-3", "1-3"]
+
+
+def test_a_server_that_stays_out_of_reach_is_one_error() -> None:
+    with Client("http://127.0.0.1:1", "token") as client, pytest.raises(UnreachableError, match="cannot be reached"):
+        next(following.updates(client, "walk", patience_s=0.05, look_s=0.01))
+
+
+def test_listeners_share_what_was_seen_and_each_hears_it_all(
     server: Server, make_episode: Callable[..., Episode]
 ) -> None:
     with server.client(Scope.READ) as client:
-        (first,) = islice(client.events("walk"), 1)
-        stream = client.events("walk", int(first.id or 0))
-        heard = [first, next(stream)]
+        streams = [client.events("walk") for _ in range(3)]
+        assert [[next(stream).id for _ in range(2)] for stream in streams] == [["1-0", "2-0"]] * 3
         commit(server.run, 2, make_episode)
-        heard.append(next(stream))
-        stream.close()
-        commit(server.run, 3, make_episode)
-        heard += islice(client.events("walk", int(heard[-1].id or 0)), 1)
-    assert ids(heard) == [0, 1, 2, 3]
-    assert [update.data["cost"] for update in heard] == [0.5, 1.5, 2.5, 3.5]
+        EventLog(server.run.pool).write([Happened(EventKind.START, "now")], "sampling")
+        for stream in streams:
+            assert {next(stream).kind, next(stream).kind} == {"iteration", "pool"}
+            stream.close()
 
 
 def test_a_stream_of_a_run_that_does_not_exist_is_refused(server: Server) -> None:
@@ -43,7 +109,7 @@ def test_a_stream_of_a_run_that_does_not_exist_is_refused(server: Server) -> Non
         next(client.events("none"))
 
 
-@pytest.mark.parametrize("last", ["-2", "x", "1e3", "9" * 30])
+@pytest.mark.parametrize("last", ["-2", "x", "1", "1-", "1-x", "9" * 30 + "-0"])
 def test_an_id_that_was_never_given_is_refused(server: Server, last: str) -> None:
     with server.http(Scope.READ) as http:
         assert http.get("/v1/runs/walk/events", headers={"Last-Event-ID": last}).status_code == 422
@@ -73,7 +139,7 @@ def test_listeners_that_take_nothing_or_are_dead_hold_up_nobody(
 
         def heard() -> bool:
             try:
-                return next(client.events("walk")).id == 0
+                return next(client.events("walk")).id == "1-0"
             except ServerError:  # all slots are taken until those that went are noticed
                 return False
 
@@ -107,9 +173,9 @@ def test_events_are_read_as_they_were_written() -> None:
         'data: {"state": 1}',
         "",
         "event: iteration",
-        "id: 7",
+        "id: 7-2",
         "data: {}",
         "",
     ]
-    assert list(parsed(lines)) == [Update("status", {"state": 1}), Update("iteration", {}, 7)]
+    assert list(parsed(lines)) == [Update("status", {"state": 1}), Update("iteration", {}, "7-2")]
     assert not list(parsed(["event: status", "data: {}"])), "an event that was cut off is none"

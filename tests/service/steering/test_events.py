@@ -93,6 +93,19 @@ def test_the_file_stays_small_and_the_newest_events_are_kept(tmp_path: Path) -> 
     numbers = [int(reason) for reason in kept(tmp_path)]
     assert numbers == list(range(numbers[0], 200))
     assert len(numbers) >= 10
+    assert [event["number"] for event in events.read(Run(tmp_path))] == numbers
+
+
+def test_who_follows_a_run_is_told_each_event_once_also_of_a_run_that_is_resumed(tmp_path: Path) -> None:
+    log = EventLog(tmp_path / "pool", largest_bytes=2000)
+    log.write([Happened(EventKind.START, str(number)) for number in range(3)], "sampling")
+    followed, told = events.follow(Run(tmp_path), look_s=0.001), list[str]()
+    for number in range(3, 100):
+        told.append(next(followed)["reason"])
+        if number == 50:
+            log = EventLog(tmp_path / "pool", largest_bytes=2000)
+        log.write([Happened(EventKind.SCALE, str(number))], "sampling")
+    assert told == [str(number) for number in range(97)]
 
 
 def test_a_line_that_was_cut_off_hides_no_other_and_a_damaged_one_is_named(tmp_path: Path) -> None:

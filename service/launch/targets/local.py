@@ -8,6 +8,7 @@ import signal
 import socket
 import subprocess
 import sys
+import threading
 from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
@@ -15,7 +16,7 @@ from pathlib import Path
 from t6gps.service.config import Config
 from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import Job, JobState, outcome
-from t6gps.service.launch.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher
 from t6gps.service.ray_backend import processes
 from t6gps.storage.errors import RunError
 
@@ -69,6 +70,7 @@ def _started(folder: Folder) -> str:
             )
     except FileNotFoundError as error:
         raise RunError(f"cannot start a job on this machine: no {error.filename}; install bash") from None
+    threading.Thread(target=process.wait, daemon=True).start()  # a server that lives longer leaves no zombie
     return f"{socket.gethostname()}:{process.pid}:{processes.started(process.pid)}"
 
 

@@ -9,8 +9,8 @@ from fastapi import APIRouter, Path
 
 from t6gps.service.remote.messages import AuditLine, IssuedToken, TokenLine, TokenName, TokenRequest
 from t6gps.service.server import audit, tokens
-from t6gps.service.server.access import REFUSALS, Administering, Administration, Place
 from t6gps.service.server.guard import utc_now
+from t6gps.service.server.routes.access import REFUSALS, Administering, Administration, Place
 
 routes = APIRouter(prefix="/v1", responses=REFUSALS, tags=["admin"])
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Callable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -14,15 +14,19 @@ from fastapi import Depends, HTTPException, Path, Request
 from fastapi.security import HTTPBearer
 from pydantic import JsonValue
 
+from t6gps.service.launch import job as records
+from t6gps.service.launch.job import Job
 from t6gps.service.remote.messages import Refusal, RunName, Scope
 from t6gps.service.server import audit
-from t6gps.service.server.jobs import Launch
+from t6gps.service.server.feed import Feeds
+from t6gps.service.server.launching import Launch
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
-READING_N, OPERATING_N, STREAMS_N = 2, 8, 64
-"""How much may be under way at once: queries and the like, changes that wait for their effect, streams of events."""
+READING_N, COPYING_N, OPERATING_N, STREAMS_N = 2, 2, 8, 64
+"""How much may be under way at once: queries and the like, lists of files with their digests, changes that wait for
+their effect, streams of events."""
 Answers: TypeAlias = dict[int | str, dict[str, object]]
 REFUSED = (
     HTTPStatus.BAD_REQUEST,
@@ -73,16 +77,18 @@ class Slots:
 
 @dataclass(frozen=True)
 class Served:
-    """What a server serves: a root, what starts the process of a run, and room for heavy work."""
+    """What a server serves: a root, what lets a job train a run, what is listened to, and room for heavy work."""
 
     root: Folder
     launch: Launch
     reading: Slots = field(default_factory=lambda: Slots(READING_N))
+    copying: Slots = field(default_factory=lambda: Slots(COPYING_N))
     operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
     streams: Slots = field(default_factory=lambda: Slots(STREAMS_N))
+    feeds: Feeds = field(default_factory=Feeds)
 
 
-def _served(request: Request) -> Served:
+async def _served(request: Request) -> Served:  # async: what reads no file needs no thread
     return cast(Served, request.app.state.served)
 
 
@@ -97,8 +103,8 @@ def _check(request: Request, scope: Scope) -> None:
         raise HTTPException(HTTPStatus.FORBIDDEN, sentence)
 
 
-def _asking(scope: Scope) -> Callable[..., None]:
-    def check(request: Request, _: Annotated[object, Depends(_bearer)]) -> None:
+def _asking(scope: Scope) -> Callable[..., Awaitable[None]]:
+    async def check(request: Request, _: Annotated[object, Depends(_bearer)]) -> None:
         _check(request, scope)
 
     return check
@@ -121,7 +127,20 @@ Administration = Annotated[dict[str, JsonValue], Depends(_changing(Scope.ADMIN))
 """Of a route that changes something: what the audit shall say of it, beside who and when."""
 
 
-def _named(place: Place, name: Annotated[RunName, Path(description="Name of a run.")]) -> Run:
+def contents(kinds: Iterable[str], what: str) -> Answers:
+    """What a route answers with that is no JSON, for the document."""
+    return {200: {"content": {kind: {} for kind in kinds}, "description": what}}
+
+
+Name = Annotated[RunName, Path(description="Name of a run.")]
+
+
+def training(place: Served, name: str) -> Job | None:
+    """The job that trains a run of the root."""
+    return records.training(place.root, name)
+
+
+def _named(place: Place, name: Name) -> Run:
     try:
         return catalog.open_run(place.root, name)
     except RunError as error:

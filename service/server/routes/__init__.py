@@ -1,0 +1,1 @@
+"""What the server is asked, route by route."""

@@ -1,0 +1,83 @@
+"""Routes that say how runs are, and what happens to them."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator
+from typing import Annotated
+
+from fastapi import APIRouter, Header
+from fastapi.responses import StreamingResponse
+from starlette.types import Receive, Scope, Send
+
+from t6gps.service.remote.messages import CursorText
+from t6gps.service.remote.stream import START
+from t6gps.service.server import updates
+from t6gps.service.server.feed import Cursor
+from t6gps.service.server.routes.access import REFUSALS, NamedRun, Place, Reading, Slots, contents
+from t6gps.service.steering import events as happened
+from t6gps.service.steering import status as statuses
+from t6gps.service.steering.events import Event
+from t6gps.service.steering.status import Status
+from t6gps.service.training import summary
+from t6gps.service.training.summary import Row, RunSummary
+from t6gps.storage import catalog
+
+routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS, tags=["read"])
+
+
+@routes.get("")
+def runs(place: Place) -> list[RunSummary]:
+    """The runs, damaged ones included."""
+    with place.reading.taken():
+        return [summary.summary(run) for run in catalog.list_runs(place.root)]
+
+
+@routes.get("/{name}/status")
+def status(run: NamedRun) -> Status:
+    """How a run is: its workers, what is under way, who waits for whom and since when."""
+    return statuses.status(run)
+
+
+@routes.get("/{name}/metrics")
+def metrics(run: NamedRun, place: Place) -> list[Row]:
+    """The learning curve: rows of the table `iterations`."""
+    with place.reading.taken():
+        return summary.iterations(run)
+
+
+@routes.get("/{name}/history")
+def history(run: NamedRun, place: Place) -> list[Event]:
+    """What happened to a run's workers and episodes, each with its reason."""
+    with place.reading.taken():
+        return happened.read(run)
+
+
+@routes.get(
+    "/{name}/events",
+    response_class=StreamingResponse,
+    responses=contents(["text/event-stream"], "Events."),
+)
+async def events(
+    run: NamedRun,
+    place: Place,
+    last_event_id: Annotated[CursorText, Header()] = START,
+) -> StreamingResponse:
+    """Live updates as server-sent events: iterations and events of the pool with their ids, changes of the status."""
+    place.streams.take()
+    return _Stream(updates.stream(place.feeds, run, Cursor.of(last_event_id)), place.streams)
+
+
+class _Stream(StreamingResponse):
+    """A stream of events, which gives its slot back however it ends."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, events: AsyncIterator[str], slots: Slots) -> None:
+        super().__init__(events, headers={"Cache-Control": "no-store"})
+        self._slots = slots
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._slots.give_back()
