@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import os
 import shutil
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -51,7 +51,8 @@ def repair(run: Run, copy: Run | None, verify: Callable[[Run], list[Fault]]) -> 
 def _mended(
     run: Run, draft: Run, copy: Run | None, faults: list[Fault], verify: Callable[[Run], list[Fault]]
 ) -> list[str]:
-    shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=_link)
+    hidden = shutil.ignore_patterns(".*")
+    shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=_link, ignore=hidden)
     sentences = []
     if copy is not None:
         unsound = verify(copy)
@@ -70,14 +71,13 @@ def _link(source: str, target: str) -> None:
     """The same file under another name; a copy where the file system has no such names."""
     try:
         os.link(source, target)
-    except PermissionError:
+    except OSError:
         shutil.copy2(source, target)
 
 
 def _put_in_place(draft: Path, run: Path) -> None:
     """Make the run's files those of the draft: what was set aside first, then what is new, then what has gone."""
-    wanted = {path.relative_to(draft) for path in draft.rglob("*") if path.is_file()}
-    there = {path.relative_to(run) for path in run.rglob("*") if path.is_file()}
+    wanted, there = (set(_files(folder)) for folder in (draft, run))
     for place in sorted(wanted, key=lambda place: (place.parts[0] != mending.DAMAGED, place)):
         if place not in there or not (draft / place).samefile(run / place):
             (run / place).parent.mkdir(parents=True, exist_ok=True)
@@ -85,8 +85,16 @@ def _put_in_place(draft: Path, run: Path) -> None:
     for place in sorted(there - wanted, reverse=True):
         (run / place).unlink()
     for folder in sorted((path for path in run.rglob("*") if path.is_dir()), reverse=True):
-        if not (draft / folder.relative_to(run)).exists():
+        if not any(folder.iterdir()) and not (draft / folder.relative_to(run)).exists():
             folder.rmdir()
-    for folder in (path for path in run.rglob("*") if path.is_dir()):
-        durable.sync(folder)
+        else:
+            durable.sync(folder)
     durable.sync(run)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files by their paths in a folder, without hidden ones: locks, and what is not finished."""
+    for path in folder.rglob("*"):
+        place = path.relative_to(folder)
+        if path.is_file() and not any(part.startswith(".") for part in place.parts):
+            yield place
