@@ -37,6 +37,7 @@ NAME_LENGTH_N = 64
 GLANCE_S = 0.5
 """Somebody who only looks whether a run is in use holds its lock for less."""
 NO_FILES: Mapping[str, bytes] = MappingProxyType({})
+_EVALUATING = ".evaluating"
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
 
 
@@ -132,16 +133,16 @@ def create(
             path = draft.path / place
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(content)
-        return _claimed(draft, root, name, numbered)
+        return _claimed(draft, root, name, "create", numbered)
 
 
 def copy(run: Run, root: Path, name: str) -> Run:
     """Copy a run that nobody uses, whole or not at all. Raises RunError as `create`, and where the run is in use."""
     root = whole(root)
-    with _unused(run), _drafted(root, name, "copy") as draft:
+    with _unused(run), unevaluated(run), _drafted(root, name, "copy") as draft:
         shutil.copytree(run.path, draft.path, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
         (draft.path / ".lock").touch()
-        return _claimed(draft, root, name)
+        return _claimed(draft, root, name, "copy")
 
 
 def move(run: Run, root: Path, name: str) -> Run:
@@ -150,7 +151,7 @@ def move(run: Run, root: Path, name: str) -> Run:
     Between file systems it is copied, then removed.
     """
     root = whole(root)
-    with locked(run):
+    with locked(run), unevaluated(run):
         try:
             root.mkdir(parents=True, exist_ok=True)
             if durable.claim(run.path, root / check_name(name)):
@@ -160,7 +161,7 @@ def move(run: Run, root: Path, name: str) -> Run:
             if error.errno != errno.EXDEV:
                 raise RunError(f"cannot move run {run.name} to {root}: {error}; the root must be writable") from error
         else:
-            raise _taken(root / name)
+            raise _taken(root / name, "move")
     moved = copy(run, root, name)
     remove(run)
     return moved
@@ -168,8 +169,14 @@ def move(run: Run, root: Path, name: str) -> Run:
 
 def remove(run: Run) -> None:
     """Remove a run that nobody uses; nobody ever sees half of it. Raises RunError where it is in use."""
-    with locked(run):
+    with locked(run), unevaluated(run):
         durable.discard(run.path)
+
+
+def size(run: Run) -> int:
+    """Bytes of a run's files."""
+    files = (Path(folder) / name for folder, _, names in os.walk(run.path) for name in names)
+    return sum(file.stat().st_size for file in files if file.is_file())
 
 
 def discard_unused(run: Run) -> None:
@@ -184,7 +191,7 @@ def _drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterat
     """A hidden folder for a run of that name. RunError where the name is taken, or the root cannot be written."""
     path = root / check_name(name)
     if not numbered and os.path.lexists(path):
-        raise _taken(path)
+        raise _taken(path, what)
     try:
         root.mkdir(parents=True, exist_ok=True)
         if not os.access(root, os.W_OK | os.X_OK):
@@ -198,7 +205,7 @@ def _drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterat
         ) from error
 
 
-def _claimed(draft: Run, root: Path, name: str, numbered: bool = False) -> Run:
+def _claimed(draft: Run, root: Path, name: str, what: str, numbered: bool = False) -> Run:
     """The run that a draft becomes, under its name or the first number that is free. RunError when it is taken."""
     durable.sync_tree(draft.path)
     numbers = itertools.count(2) if numbered else ()
@@ -206,11 +213,12 @@ def _claimed(draft: Run, root: Path, name: str, numbered: bool = False) -> Run:
         path = root / check_name(free)
         if not os.path.lexists(path) and durable.claim(draft.path, path):
             return Run(path)
-    raise _taken(root / name)
+    raise _taken(root / name, what)
 
 
-def _taken(path: Path) -> RunError:
-    return RunError(f"{path} exists already; choose another name with --run, or add --resume")
+def _taken(path: Path, what: str) -> RunError:
+    remedy = " with --run, or add --resume" if what == "create" else ""
+    return RunError(f"{path} exists already; choose another name{remedy}")
 
 
 def open_run(root: Path, name: str) -> Run:
@@ -284,6 +292,27 @@ def _unused(run: Run) -> Iterator[None]:
     with _lock_file(run, "r") as file:
         if not _locked(file, fcntl.LOCK_SH):
             raise RunError(f"run {run.name} is in use by process {file.read() or 'unknown'}; wait for it to end")
+        yield
+
+
+@contextmanager
+def evaluating(run: Run) -> Iterator[None]:
+    """Let nobody copy, move or remove the run meanwhile; others may train and evaluate it."""
+    with (run.path / _EVALUATING).open("a") as file:
+        fcntl.flock(file, fcntl.LOCK_SH)
+        yield
+
+
+@contextmanager
+def unevaluated(run: Run) -> Iterator[None]:
+    """Let nobody evaluate the run meanwhile; this writes nothing. Raises RunError where somebody does."""
+    path = run.path / _EVALUATING
+    if not path.exists():  # nobody has ever done so
+        yield
+        return
+    with path.open("r") as file:
+        if not _locked(file, fcntl.LOCK_EX):
+            raise RunError(f"run {run.name} is in use: somebody evaluates it; wait for that to end")
         yield
 
 

@@ -7,6 +7,7 @@ processes may make at once is built in a `draft` of its own; one rename gives it
 from __future__ import annotations
 
 import errno
+import hashlib
 import logging
 import os
 import secrets
@@ -36,6 +37,12 @@ def sync_tree(folder: Path) -> None:
     """Force a folder and everything in it to disk."""
     for path in (*folder.rglob("*"), folder):
         sync(path)
+
+
+def sha256(file: Path) -> str:
+    """The SHA-256 of a file's content, which is read in pieces."""
+    with file.open("rb") as content:
+        return hashlib.file_digest(content, "sha256").hexdigest()
 
 
 def hidden(path: Path) -> Path:

@@ -19,7 +19,7 @@ import typer
 from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import doctor, door, launching, live, serving, stored
+from t6gps.service.cli import care, doctor, door, launching, live, serving, stored
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -202,6 +202,7 @@ def bench(
 
 
 stored.add_to(app)
+care.add_to(app)
 live.add_to(app)
 launching.add_to(app)
 serving.add_to(app)

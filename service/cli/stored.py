@@ -47,13 +47,23 @@ def add_to(app: typer.Typer) -> None:
         app.command()(command)
 
 
-def runs(root: Root = DEFAULT_ROOT, server: Server = None) -> None:
+def runs(
+    root: Root = DEFAULT_ROOT,
+    server: Server = None,
+    size: Annotated[bool, typer.Option("--size", help="Say how much room each takes.")] = False,
+) -> None:
     """List the runs."""
+    if size and server is not None:
+        raise ConfigError("--size measures folders of this machine; leave out --size or --server")
     with door.opened(root, server) as there:
         summaries = there.runs()
     columns = {"name": ("run", "{}"), "iterations": ("iterations", "{}")}
     columns |= {key: terminal.LEARNING_COLUMNS[key] for key in ("cost", "forward_speed_m_per_s")}
     rows = [asdict(run) | {"iterations": _iterations(run)} for run in summaries]
+    if size:
+        columns["mb"] = ("MB", "{:.1f}")
+        for row in rows:
+            row["mb"] = catalog.size(Run(catalog.whole(root) / row["name"])) / 1e6
     terminal.print_rows(f"Runs in {root}" if server is None else f"Runs of {server}", rows, columns)
     for run in summaries:
         if run.fault is not None:

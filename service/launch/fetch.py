@@ -5,7 +5,6 @@ A copy that was cut off is continued: what has come already stays in ROOT/.fetch
 
 from __future__ import annotations
 
-import hashlib
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -71,11 +70,7 @@ class FolderSource:
 
 def described(path: Path) -> File:
     """A file as it lies here."""
-    digest = hashlib.sha256()
-    with path.open("rb") as file:
-        while piece := file.read(PIECE_BYTES):
-            digest.update(piece)
-        return File(file.tell(), digest.hexdigest())
+    return File(path.stat().st_size, durable.sha256(path))
 
 
 def fetch(source: Source, root: Path, name: str, progress: Callable[[int, int], None]) -> Run:

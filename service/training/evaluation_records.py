@@ -16,7 +16,7 @@ from t6gps.service import provenance
 from t6gps.service.config import Config
 from t6gps.service.training import origin
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.storage import durable, tables
+from t6gps.storage import catalog, durable, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import evaluations
 from t6gps.storage.errors import DataError, RunError
@@ -50,7 +50,7 @@ def collecting(run: Run) -> Iterator[Spool]:
     """Where the episodes of an evaluation wait for each other. RunError where the run takes no files."""
     try:
         durable.sweep(run.path)
-        with durable.draft(run.path / "evaluation") as folder:
+        with catalog.evaluating(run), durable.draft(run.path / "evaluation") as folder:
             yield Spool(folder, 0)
     except PermissionError as error:
         raise RunError(

@@ -6,6 +6,7 @@ import json
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
+from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
@@ -23,6 +24,9 @@ MESSAGE_LENGTH_N = 300
 
 IDENTITIES = {"iteration", "episode_id", "evaluation_id", "version"}
 """Columns whose ranges the log has, so that readers of Delta tables skip files."""
+
+SHA256 = "sha256"
+"""What a commit calls the digest of its file, which covers what no checksum of a page does."""
 
 _APPLICATION = "t6gps"
 """Application id of the Delta transactions; their version is the number of the file."""
@@ -71,13 +75,28 @@ def add(run: Run, table: str, number: int, stem: str, groups: Iterable[pa.Table]
     statistics = _Statistics()
     folder.mkdir(exist_ok=True)
     parquet.write(file, schema.TABLES[table], map(statistics.seen, groups))
-    definition = Schema.from_arrow(schema.TABLES[table])
-    delta = delta or DeltaTable.create(str(folder), definition)
+    _commit(run, table, file, number, statistics)
+
+
+def add_again(run: Run, table: str, number: int, file: Path) -> None:
+    """Commit a file that is there, to a log that is being built anew. ArrowException or OSError where it is torn."""
+    statistics = _Statistics()
+    for group in parquet.groups(file, sorted(IDENTITIES.intersection(schema.TABLES[table].names))):
+        statistics.seen(group)
+    _commit(run, table, file, number, statistics)
+
+
+def _commit(run: Run, table: str, file: Path, number: int, statistics: _Statistics) -> None:
+    """Make a file that is on disk part of its table, durably."""
+    folder, definition = run.tables / table, Schema.from_arrow(schema.TABLES[table])
+    delta = opened(run, table) or DeltaTable.create(str(folder), definition)
     delta.create_write_transaction(
         [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
         "append",
         definition,
-        commit_properties=CommitProperties(app_transactions=[Transaction(_APPLICATION, number)]),
+        commit_properties=CommitProperties(
+            custom_metadata={SHA256: durable.sha256(file)}, app_transactions=[Transaction(_APPLICATION, number)]
+        ),
         # Checkpoints of the log are not forced to disk by the library; a run's log is short enough without.
         post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
     )
@@ -102,7 +121,7 @@ def damaged(run: Run, table: str, what: str) -> DataError:
     """The error for a table that is not whole."""
     return DataError(
         f"run {run.name} is not whole: table {table} in {run.tables / table} cannot be read: {what}; "
-        "restore the run from a copy"
+        f"restore the run from a copy: t6gps repair {run.name} --from COPY"
     )
 
 

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -52,6 +52,13 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
         durable.hidden(file).unlink(missing_ok=True)
         raise
     durable.publish(file)
+
+
+def groups(file: Path, columns: list[str]) -> Iterator[pa.Table]:
+    """Columns of a file's row groups, one after the other. ArrowException or OSError where the file is torn."""
+    with pq.ParquetFile(file, page_checksum_verification=True) as found:
+        for number in range(found.num_row_groups):
+            yield found.read_row_group(number, columns)
 
 
 def holds(file: Path, groups: Iterable[pa.Table]) -> bool:

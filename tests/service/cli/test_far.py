@@ -32,11 +32,16 @@ from t6gps.storage import catalog
 COMMANDS: dict[str, click.Command] = getattr(typer.main.get_command(app), "commands", {})
 HERE_ALONE = {
     "bench": "measures this machine",
+    "cp": "copies folders of this machine; fetch brings a run from a server",
     "doctor": "looks at this machine",
     "export": "needs no run",
+    "mv": "moves folders of this machine",
+    "repair": "changes folders of this machine, by copies that it sees",
     "replay": "takes a file of this machine, which fetch brings",
+    "rm": "removes folders of this machine for good",
     "serve": "is the server",
     "study": "conducts many runs, each of which train --server could start",
+    "verify": "reads every byte, so it works where the files are",
     "submit": "chooses where a job runs; train --server submits to the server's machine",
 }
 """Commands that know no server, and why."""

@@ -1,0 +1,217 @@
+"""A table of a run as it lies on disk: its log has no gap, and each of its files is there with every page as written.
+
+Files are read a row group at a time. Of each row stays what other tables refer to, of frames one row per episode.
+"""
+
+from __future__ import annotations
+
+import json
+import re
+from collections.abc import Iterator, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyarrow as pa
+import pyarrow.compute as pc
+import pyarrow.parquet as pq
+
+from t6gps.storage import durable, schema
+from t6gps.storage.care.fault import Fault, within
+from t6gps.storage.catalog import Run
+from t6gps.storage.delta import log, parquet, policies
+from t6gps.storage.errors import DataError
+
+KEYS = {
+    "frames": ("iteration", "episode_id", "step", "policy_version"),
+    "episodes": ("iteration", "episode_id", "steps", "policy_version"),
+    "iterations": ("iteration", "policy_version", "episodes", "steps"),
+    "classes": ("iteration",),
+    "models": ("iteration",),
+    "policies": ("iteration", "version", "parent"),
+    "evaluations": ("evaluation_id", "policy_version", "episodes"),
+    "evaluation_episodes": ("evaluation_id", "episode_id", "steps", "policy_version"),
+    "evaluation_frames": ("evaluation_id", "episode_id", "step", "policy_version"),
+}
+"""Columns by which tables refer to each other."""
+_NUMBER = re.compile(r"(?:iteration|evaluation)-(\d{6})\.parquet")
+
+
+@dataclass(frozen=True)
+class Entry:
+    """A file of a table: what the commit in its log says of it. Commits of earlier versions have no SHA-256.
+
+    ranges   least and largest entry of columns, by which readers skip files
+    """
+
+    path: Path
+    size: int
+    rows_n: int | None
+    sha256: str | None
+    ranges: dict[str, tuple[int, int]]
+
+    @property
+    def number(self) -> int | None:
+        """Of its iteration or evaluation."""
+        return number_of(self.path.name)
+
+
+@dataclass
+class Found:
+    """A table as far as it could be read.
+
+    committed_n   files that its log has had
+    files         those that it has now
+    keys          by file, the columns KEYS of its rows; of frames, a row for each episode with its `frames`
+    faults        what is wrong
+    """
+
+    table: str
+    committed_n: int = 0
+    files: list[Entry] = field(default_factory=list)
+    keys: dict[str, pa.Table] = field(default_factory=dict)
+    faults: list[Fault] = field(default_factory=list)
+
+
+def number_of(name: str) -> int | None:
+    """The iteration or evaluation whose rows a file of that name holds."""
+    matched = _NUMBER.fullmatch(name)
+    return int(matched[1]) if matched else None
+
+
+def opened(run: Run, table: str) -> Found:
+    """What the log of a table says, and what is wrong with the log."""
+    found, sums = Found(table), dict[str, str]()
+    folder = run.tables / table / "_delta_log"
+    versions = {int(path.stem): path for path in folder.glob("*.json") if path.stem.isdecimal()}
+    for version in range(max(versions, default=-1) + 1):
+        path = versions.get(version, folder / f"{version:020d}.json")
+        try:
+            sums |= _sums(path)
+        except (OSError, ValueError, TypeError, KeyError) as error:
+            what = "the commit is missing" if version not in versions else f"the commit cannot be read: {error!r}"
+            found.faults.append(Fault(table, within(run, path), what, repairable=True))
+    if found.faults:
+        return found
+    try:
+        delta = log.opened(run, table)
+        if delta is None:
+            return found
+        with log.readable(run, table):
+            actions = pa.table(delta.get_add_actions(flatten=True)).sort_by("path").to_pylist()
+            wrong = _schema_wrong(table, pa.schema(delta.schema().to_arrow()))
+    except DataError as error:
+        wrong = str(error)
+    else:
+        found.committed_n = log.committed(delta)
+        found.files = [_entry(run, table, row, sums) for row in actions]
+    if wrong is not None:
+        found.faults.append(Fault(table, within(run, folder), wrong, repairable=True))
+    return found
+
+
+def _sums(commit: Path) -> dict[str, str]:
+    """The SHA-256 that a commit has of its file. OSError, ValueError, TypeError or KeyError for one that is damaged."""
+    content = commit.read_text(encoding="utf-8")
+    actions = [action for line in content.splitlines() for action in json.loads(line).items()]
+    if not actions:
+        raise ValueError("it is empty")
+    digest = next((values.get(log.SHA256) for kind, values in actions if kind == "commitInfo"), None)
+    return {values["path"]: digest for kind, values in actions if kind == "add" and digest is not None}
+
+
+def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, str]) -> Entry:
+    ranges = {name: (action.get(f"min.{name}"), action.get(f"max.{name}")) for name in log.IDENTITIES}
+    return Entry(
+        run.tables / table / action["path"],
+        action["size_bytes"],
+        action.get("num_records"),
+        sums.get(action["path"]),
+        {name: (least, most) for name, (least, most) in ranges.items() if least is not None and most is not None},
+    )
+
+
+def examine(run: Run, found: Found, entry: Entry) -> None:
+    """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong."""
+    try:
+        keys = _keys(found.table, entry)
+    except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
+        what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
+        found.faults.append(Fault(found.table, within(run, entry.path), what, entry.number))
+    else:
+        found.keys[entry.path.name] = keys
+
+
+def _keys(table: str, entry: Entry) -> pa.Table:
+    """The keys of a file that is as it was written, else some error."""
+    if not entry.path.is_file():
+        raise ValueError("it is missing")
+    size = entry.path.stat().st_size
+    if size != entry.size:
+        raise ValueError(f"its log has {entry.size} bytes, found {size}")
+    if entry.sha256 not in (None, durable.sha256(entry.path)):
+        raise ValueError("it was altered: it fails the SHA-256 in its log")
+    with pq.ParquetFile(entry.path, page_checksum_verification=True) as file:
+        wrong = _schema_wrong(table, file.schema_arrow)
+        if wrong is not None:
+            raise ValueError(wrong)
+        groups = [schema.TABLES[table].empty_table().select(KEYS[table])]
+        for number in range(file.num_row_groups):
+            rows = file.read_row_group(number)
+            if table == "policies":
+                for row in rows.to_pylist():
+                    policies.policy(row)  # against its SHA-256
+            groups.append(rows.select(KEYS[table]))
+    keys = pa.concat_tables(group.replace_schema_metadata(None).cast(_bare(table)) for group in groups)
+    if entry.rows_n not in (None, keys.num_rows):
+        raise ValueError(f"its log has {entry.rows_n} rows, found {keys.num_rows}")
+    for name, ends in entry.ranges.items():
+        there = pc.min_max(keys.column(name)).as_py()
+        if ends != (there["min"], there["max"]):
+            raise ValueError(f"its log has {ends[0]} .. {ends[1]} for {name}, found {there['min']} .. {there['max']}")
+    return _by_episode(keys) if "frames" in table else keys
+
+
+def _bare(table: str) -> pa.Schema:
+    """The keys' types alone: units and whether null is allowed may differ between versions."""
+    return pa.schema([(name, schema.TABLES[table].field(name).type) for name in KEYS[table]])
+
+
+def _schema_wrong(table: str, there: pa.Schema) -> str | None:
+    """How columns differ from those of the table, of which older files may lack some that may be null."""
+    for column in schema.TABLES[table]:
+        if column.name not in there.names:
+            if not column.nullable:
+                return f"column {column.name} is missing"
+        elif there.field(column.name).type != column.type:
+            return f"column {column.name} must be {column.type}, found {there.field(column.name).type}"
+    unknown = set(there.names) - set(schema.TABLES[table].names)
+    return f"column {min(unknown)} is unknown" if unknown else None
+
+
+def _by_episode(keys: pa.Table) -> pa.Table:
+    """A row for each stretch of an episode's frames, and how many there are. ValueError for steps out of order."""
+    numbers, steps = keys.column("episode_id").to_numpy(), keys.column("step").to_numpy()
+    starts = np.flatnonzero(np.diff(numbers, prepend=numbers[:1] - 1))
+    lengths = np.diff(starts, append=len(steps))
+    wrong = np.flatnonzero(steps != np.arange(len(steps)) - np.repeat(starts, lengths))
+    if len(wrong):
+        raise ValueError(f"the frames of episode {numbers[wrong[0]]} are not those of steps 0 .. T in order")
+    return keys.take(starts).drop_columns("step").append_column("frames", pa.array(lengths))
+
+
+def begun_with(found: Found) -> int | None:
+    """The schema version of the oldest file, None where it cannot be read."""
+    for entry in found.files[:1]:
+        try:
+            return parquet.version(str(entry.path))
+        except (pa.ArrowException, OSError):
+            return None
+    return None
+
+
+def rows(found: Found) -> Iterator[dict[str, int | None]]:
+    """The keys of all rows."""
+    for keys in found.keys.values():
+        yield from keys.to_pylist()

@@ -1,0 +1,100 @@
+"""Repairing a run: everything is done in a draft beside it first, then the files that differ get their places.
+
+Nothing is deleted: damaged files go to RUN/damaged. A repair that fails changes nothing. One that is killed while files
+get their places leaves each file old or new; repairing again ends it.
+"""
+
+from __future__ import annotations
+
+import os
+import shutil
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from pathlib import Path
+
+from t6gps.storage import catalog, durable
+from t6gps.storage.care import losses, mending
+from t6gps.storage.care.fault import Fault
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
+
+
+@dataclass(frozen=True)
+class Repaired:
+    """What was done to a run, in sentences, and the faults that it has still."""
+
+    sentences: list[str]
+    left: list[Fault]
+
+
+def repair(run: Run, copy: Run | None, verify: Callable[[Run], list[Fault]]) -> Repaired:
+    """Mend a run that nobody uses. RunError where somebody does, for a copy of another, or one that takes no files.
+
+    verify   all faults of a run
+    """
+    with catalog.locked(run), catalog.unevaluated(run):
+        faults = verify(run)
+        if not faults:
+            return Repaired([], [])
+        try:
+            with durable.draft(run.path) as folder:
+                sentences = _mended(run, Run(folder), copy, faults, verify)
+                durable.sync_tree(folder)
+                _put_in_place(folder, run.path)
+        except OSError as error:
+            raise RunError(
+                f"cannot repair run {run.name}: {error}; make room beside it, with leave to write"
+            ) from error
+        return Repaired(sentences, verify(run))
+
+
+def _mended(
+    run: Run, draft: Run, copy: Run | None, faults: list[Fault], verify: Callable[[Run], list[Fault]]
+) -> list[str]:
+    hidden = shutil.ignore_patterns(".*")
+    shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=_link, ignore=hidden)
+    sentences = []
+    if copy is not None:
+        unsound = verify(copy)
+        for take in (mending.from_copy, mending.tables_from_copy):
+            sentences += take(draft, copy, faults, unsound)
+            faults = verify(draft)
+    for way in (mending.rebuilt_logs, mending.from_spool, losses.without):
+        done = way(draft, faults)
+        if done:
+            faults = verify(draft)
+        sentences += done
+    return sentences
+
+
+def _link(source: str, target: str) -> None:
+    """The same file under another name; a copy where the file system has no such names."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
+def _put_in_place(draft: Path, run: Path) -> None:
+    """Make the run's files those of the draft: what was set aside first, then what is new, then what has gone."""
+    wanted, there = (set(_files(folder)) for folder in (draft, run))
+    for place in sorted(wanted, key=lambda place: (place.parts[0] != mending.DAMAGED, place)):
+        if place not in there or not (draft / place).samefile(run / place):
+            (run / place).parent.mkdir(parents=True, exist_ok=True)
+            (draft / place).replace(run / place)
+    for place in sorted(there - wanted, reverse=True):
+        (run / place).unlink()
+    for folder in sorted((path for path in run.rglob("*") if path.is_dir()), reverse=True):
+        if not any(folder.iterdir()) and not (draft / folder.relative_to(run)).exists():
+            folder.rmdir()
+        else:
+            durable.sync(folder)
+    durable.sync(run)
+
+
+def _files(folder: Path) -> Iterator[Path]:
+    """Files by their paths in a folder, without hidden ones: locks, and what is not finished."""
+    for path in folder.rglob("*"):
+        place = path.relative_to(folder)
+        if path.is_file() and not any(part.startswith(".") for part in place.parts):
+            yield place

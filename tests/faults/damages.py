@@ -1,0 +1,89 @@
+"""Damages that tests plant into a run of three iterations, with the part of the run that each is found in."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+from collections.abc import Callable
+from pathlib import Path
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from t6gps.storage import durable
+from t6gps.storage.catalog import Run
+from t6gps.storage.delta import log
+from t6gps.storage.spool import Spool
+
+
+def flip(file: Path, place: int) -> None:
+    """Change one bit of a file."""
+    content = bytearray(file.read_bytes())
+    content[place] ^= 1
+    file.write_bytes(content)
+
+
+def rewrite(run: Run, table: str, number: int, change: Callable[[pa.Table], pa.Table], digest: bool = True) -> None:
+    """Change the rows of a file and its commit with it, so that the table is whole by itself."""
+    file = run.tables / table / f"iteration-{number:06d}.parquet"
+    rows = change(pq.read_table(file))
+    pq.write_table(rows, file)
+    commit = run.tables / table / "_delta_log" / f"{number + 1:020d}.json"
+    actions = [json.loads(line) for line in commit.read_text().splitlines()]
+    for action in actions:
+        if "commitInfo" in action:
+            del action["commitInfo"][log.SHA256]
+            action["commitInfo"] |= {log.SHA256: durable.sha256(file)} if digest else {}
+        if "add" in action:
+            action["add"] |= {"size": file.stat().st_size, "stats": json.dumps({"numRecords": rows.num_rows})}
+    commit.write_text("\n".join(map(json.dumps, actions)))
+
+
+def with_column(rows: pa.Table, name: str, value: object) -> pa.Table:
+    """The rows, one of whose columns holds a value in its first row."""
+    place = rows.schema.get_field_index(name)
+    values = [value, *rows.column(name).to_pylist()[1:]]
+    return rows.set_column(place, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
+
+
+def commit_of(table: str, number: int) -> str:
+    return f"tables/{table}/_delta_log/{number:020d}.json"
+
+
+DAMAGES: dict[str, tuple[str, Callable[[Run], object]]] = {
+    "a bit of a page": ("frames", lambda run: flip(run.tables / "frames" / "iteration-000001.parquet", 2000)),
+    "a bit of a footer": ("classes", lambda run: flip(run.tables / "classes" / "iteration-000001.parquet", -60)),
+    "half a file": ("models", lambda run: os.truncate(run.tables / "models" / "iteration-000000.parquet", 400)),
+    "no file": ("episodes", lambda run: (run.tables / "episodes" / "iteration-000002.parquet").unlink()),
+    "gap in a log": ("iterations", lambda run: (run.path / commit_of("iterations", 1)).unlink()),
+    "torn commit": ("policies", lambda run: os.truncate(run.path / commit_of("policies", 2), 60)),
+    "end of a log": ("classes", lambda run: (run.path / commit_of("classes", 3)).unlink()),
+    "end of the last log": ("episodes", lambda run: (run.path / commit_of("episodes", 3)).unlink()),
+    "no table": ("evaluation_frames", lambda run: shutil.rmtree(run.tables / "evaluation_frames")),
+    "a frame too few": ("frames", lambda run: rewrite(run, "frames", 1, lambda rows: rows.slice(0, rows.num_rows - 1))),
+    "frames out of order": (
+        "frames",
+        lambda run: rewrite(run, "frames", 1, lambda rows: rows.take([1, 0, *range(2, rows.num_rows)])),
+    ),
+    "an episode too few": ("episodes", lambda run: rewrite(run, "episodes", 2, lambda rows: rows.slice(1))),
+    "a count that is wrong": (
+        "episodes",
+        lambda run: rewrite(run, "iterations", 1, lambda rows: with_column(rows, "episodes", 4)),
+    ),
+    "a policy that is not there": (
+        "iterations",
+        lambda run: rewrite(run, "iterations", 1, lambda rows: with_column(rows, "policy_version", 9)),
+    ),
+    "a weight": (
+        "policies",
+        lambda run: rewrite(run, "policies", 2, lambda rows: with_column(rows, "weights", [0.25] * 30)),
+    ),
+    "classes of no iteration": (
+        "classes",
+        lambda run: rewrite(run, "classes", 2, lambda rows: with_column(rows, "iteration", 7)),
+    ),
+    "a checkpoint": ("checkpoints", lambda run: flip(run.checkpoints / "iteration-000003" / "arrays.npz", 40)),
+    "no mark of a checkpoint": ("checkpoints", lambda run: (run.checkpoints / "iteration-000002" / "DONE").unlink()),
+    "a spooled episode": ("spool", lambda run: os.truncate(Spool(run.spool, 3).path(300), 999)),
+}
