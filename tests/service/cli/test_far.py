@@ -34,6 +34,7 @@ HERE_ALONE = {
     "bench": "measures this machine",
     "doctor": "looks at this machine",
     "export": "needs no run",
+    "schema": "needs no run",
     "replay": "takes a file of this machine, which fetch brings",
     "serve": "is the server",
     "study": "conducts many runs, each of which train --server could start",
