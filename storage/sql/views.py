@@ -61,7 +61,7 @@ _EPISODE = (
 _FRAME = (*_EPISODE, schema.FRAMES.field("step"))
 _KIND = schema.FRAMES.field("kind")
 _CLASS = tuple(schema.CLASSES.field(name) for name in ("kind", "entry_edge", "exit_edge", "truncated"))
-_CLASS_STEP = scalar("class_step", pa.int64(), "1", "control steps since the segment began, as `step` in `models`")
+_CLASS_STEP = scalar("class_step", pa.int32(), "1", "control steps since the segment began, as `step` in `models`")
 _PLACE = tuple(schema.FRAMES.field(name) for name in ("com_x_m", "com_y_m", "com_z_m", "ground_slope_deg"))
 
 

@@ -45,7 +45,11 @@ SQL = "SELECT iteration, avg(cost) AS cost FROM episodes GROUP BY iteration ORDE
 ANSWERS = {
     "runs": [[]],
     "show": [["tiny"]],
-    "query": [["tiny", SQL], *(["tiny", SQL, "--format", form] for form in ("csv", "json", "arrow"))],
+    "query": [
+        ["tiny", SQL],
+        *(["tiny", SQL, "--format", form] for form in ("csv", "json", "arrow")),
+        ["t*", "SELECT run, run_seed + $more AS n FROM runs", "--param", "more=2", "--format", "csv"],
+    ],
     "status": [["tiny"], ["tiny", "--json"], ["paused"], ["paused", "--json"]],
     "events": [["paused"], ["paused", "--json"], ["tiny"]],
     "jobs": [[], ["--json"]],
@@ -57,7 +61,7 @@ ANSWERS = {
 REFUSALS = {
     "runs": [],
     "show": [["none"], ["a/b"]],
-    "query": [["none", SQL], ["tiny", "SELEC"], ["tiny", "SELECT x"]],
+    "query": [["none", SQL], ["none*", SQL], ["tiny", "SELEC"], ["tiny", "SELECT x"], ["tiny", "SELECT $x"]],
     "status": [["none"], ["a/b"]],
     "events": [["none"]],
     "logs": [["none"], ["paused"]],
