@@ -10,8 +10,8 @@ from t6gps.learner.bench import speed
 from t6gps.learner.phases import PHASES
 from t6gps.service import config as configuration
 from t6gps.service import seeding
-from t6gps.service.bench import growth
 from t6gps.service.bench.rounds import Say
+from t6gps.service.bench.scaling import growth
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
 from t6gps.service.execution.ray_executor import RayExecutor

@@ -8,9 +8,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from t6gps.service import checks
-from t6gps.service.bench import large_pool, latency, rounds
+from t6gps.service.bench import latency, rounds
 from t6gps.service.bench.contenders import PRESET, Job, pipes, raw, rough_job, service
 from t6gps.service.bench.rounds import Contender, Say
+from t6gps.service.bench.scaling import large_pool
 from t6gps.storage.errors import ConfigError
 
 SECONDS, ROUNDS = 30.0, 5

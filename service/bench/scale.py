@@ -22,11 +22,12 @@ import numpy as np
 
 from t6gps.learner.phases import PHASES
 from t6gps.service import config as configuration
-from t6gps.service.bench import growth, large_pool, learner
+from t6gps.service.bench import learner
 from t6gps.service.bench.contenders import rough_job
-from t6gps.service.bench.paper_pool import deciding_s
 from t6gps.service.bench.pool import check_local
 from t6gps.service.bench.rounds import Say
+from t6gps.service.bench.scaling import growth, large_pool
+from t6gps.service.bench.scaling.paper_pool import deciding_s
 from t6gps.service.config import Config
 from t6gps.service.execution.wiring import new_learner
 from t6gps.service.pool.state import PoolState

@@ -7,8 +7,8 @@ from collections.abc import Callable
 
 from t6gps.service.config import Config
 from t6gps.service.launch import submission
-from t6gps.service.launch.local import LocalLauncher
 from t6gps.service.launch.target import Kind, Local
+from t6gps.service.launch.targets.local import LocalLauncher
 from t6gps.storage.catalog import Run
 
 Launch = Callable[[Run, Config], str]

@@ -6,8 +6,8 @@ from pathlib import Path
 
 from t6gps.service import config as configuration
 from t6gps.service.launch import target as targets
-from t6gps.service.launch.kubernetes import manifests
 from t6gps.service.launch.target import K8s, Kind
+from t6gps.service.launch.targets.kubernetes import manifests
 
 FOLDER = Path(__file__).parents[2] / "deploy" / "k8s"
 

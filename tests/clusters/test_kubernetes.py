@@ -28,8 +28,8 @@ from t6gps.service import config as configuration
 from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch.fetch import FolderSource
-from t6gps.service.launch.kubernetes import manifests
 from t6gps.service.launch.target import K8s, Kind
+from t6gps.service.launch.targets.kubernetes import manifests
 from t6gps.service.steering import requests
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run

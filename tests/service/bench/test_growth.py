@@ -6,7 +6,7 @@ import pytest
 
 from t6gps.service import config as configuration
 from t6gps.service import seeding
-from t6gps.service.bench.growth import growth
+from t6gps.service.bench.scaling.growth import growth
 from t6gps.service.execution.serial import SerialExecutor
 from t6gps.storage.records import Episode
 

@@ -10,8 +10,8 @@ from t6gps.learner.phases import PHASES
 from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.bench import registry
-from t6gps.service.bench.paper_pool import PaperTransport, deciding_s
 from t6gps.service.bench.scale import FEW, HEAD, MANY, Costs, IterationCosts, most_workers, needs, of_iterations
+from t6gps.service.bench.scaling.paper_pool import PaperTransport, deciding_s
 from t6gps.service.execution.wiring import new_learner
 from t6gps.service.pool.deadlines import TIMINGS, EpisodeTimes
 from t6gps.service.pool.ledger import Ledger

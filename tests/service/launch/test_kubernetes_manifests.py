@@ -19,8 +19,8 @@ import yaml
 from command import t6gps
 
 from t6gps.service import config as configuration
-from t6gps.service.launch.kubernetes import claim, manifests
 from t6gps.service.launch.target import K8s
+from t6gps.service.launch.targets.kubernetes import claim, manifests
 from t6gps.storage.errors import ConfigError, TerrainError
 
 TARGET = K8s(image="t6gps", claim="runs", service_account="trainer", image_pull_policy="Always", pods=4, cpus_per_pod=3)

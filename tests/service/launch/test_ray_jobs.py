@@ -15,7 +15,7 @@ from command import t6gps
 from t6gps.service import config as configuration
 from t6gps.service import provenance
 from t6gps.service.launch import job as records
-from t6gps.service.launch import ray_jobs
+from t6gps.service.launch.targets import ray_jobs
 from t6gps.service.ray_backend.errands import Node, Survey
 from t6gps.storage.errors import T6GpsError
 

@@ -14,7 +14,7 @@ from t6gps.service.config import Config
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import STOPPED, Job, JobState, outcome
 from t6gps.service.launch.target import Slurm
-from t6gps.service.launch.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher
 from t6gps.storage.errors import ConfigError, RunError
 
 PROGRAMS = ("sbatch", "squeue", "scancel", "scontrol")

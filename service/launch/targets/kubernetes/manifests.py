@@ -17,9 +17,9 @@ import yaml
 
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
-from t6gps.service.launch.kubernetes import pods
-from t6gps.service.launch.kubernetes.pods import JOB, ROOT, Manifest, Size
 from t6gps.service.launch.target import K8s
+from t6gps.service.launch.targets.kubernetes import pods
+from t6gps.service.launch.targets.kubernetes.pods import JOB, ROOT, Manifest, Size
 from t6gps.storage.errors import ConfigError, TerrainError
 
 NAME_LENGTH_N = 41

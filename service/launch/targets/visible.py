@@ -9,10 +9,10 @@ from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
 from t6gps.service.config import Config
-from t6gps.service.launch import errand
 from t6gps.service.launch.fetch import FolderSource, Source
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import ENDED, Job, JobState
+from t6gps.service.launch.targets import errand
 from t6gps.service.steering import requests
 from t6gps.service.steering.status import Status
 from t6gps.storage import catalog

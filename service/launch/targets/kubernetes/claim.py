@@ -14,9 +14,9 @@ from dataclasses import dataclass, field
 from pydantic import JsonValue, TypeAdapter
 
 from t6gps.service.launch.fetch import File
-from t6gps.service.launch.kubernetes import manifests, pods
-from t6gps.service.launch.kubernetes.kubectl import Kubectl, at
 from t6gps.service.launch.target import K8s
+from t6gps.service.launch.targets.kubernetes import manifests, pods
+from t6gps.service.launch.targets.kubernetes.kubectl import Kubectl, at
 from t6gps.storage.errors import RunError
 
 STARTED_S, TICK_S = 300.0, 0.5
@@ -41,7 +41,9 @@ class Place:
 
     def errand(self, name: str, *arguments: str) -> JsonValue:
         """The answer to an errand there (`launch.errand`)."""
-        return json.loads(self.execute("python3", "-m", "t6gps.service.launch.errand", name, pods.ROOT, *arguments))
+        return json.loads(
+            self.execute("python3", "-m", "t6gps.service.launch.targets.errand", name, pods.ROOT, *arguments)
+        )
 
     def stream(self, *command: str) -> Iterator[bytes]:
         return self.kubectl.stream(self.pod, self.container, *command)

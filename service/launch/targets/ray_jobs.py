@@ -25,7 +25,7 @@ from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import OUTCOMES, Job, JobState
 from t6gps.service.launch.target import Ray
-from t6gps.service.launch.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher
 from t6gps.service.ray_backend import jobs_api
 from t6gps.service.ray_backend.errands import Node, Survey
 from t6gps.service.ray_backend.jobs_api import JobsApi

@@ -16,7 +16,7 @@ from pathlib import Path
 from t6gps.service.config import Config
 from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import Job, JobState, outcome
-from t6gps.service.launch.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher
 from t6gps.service.ray_backend import processes
 from t6gps.storage.errors import RunError
 

@@ -15,11 +15,11 @@ from t6gps.service.launch import job as records
 from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import ENDED, OUTCOMES, Job, JobState
-from t6gps.service.launch.kubernetes import claim, manifests, pods
-from t6gps.service.launch.kubernetes.claim import ClaimSource, Place
-from t6gps.service.launch.kubernetes.kubectl import Kubectl, at
-from t6gps.service.launch.kubernetes.pods import Manifest
 from t6gps.service.launch.target import K8s
+from t6gps.service.launch.targets.kubernetes import claim, manifests, pods
+from t6gps.service.launch.targets.kubernetes.claim import ClaimSource, Place
+from t6gps.service.launch.targets.kubernetes.kubectl import Kubectl, at
+from t6gps.service.launch.targets.kubernetes.pods import Manifest
 from t6gps.service.steering.status import Status
 from t6gps.storage.errors import ConfigError, RunError
 

@@ -1,4 +1,4 @@
-"""`python3 -m t6gps.service.launch.errand NAME ROOT RUN ...`: what is asked where a run lies, from elsewhere.
+"""`python3 -m t6gps.service.launch.targets.errand NAME ROOT RUN ...`: what is asked where a run lies, from elsewhere.
 
 files  ROOT RUN               its files, as {path: [size, sha256]}
 status ROOT RUN               its status, null where it has none yet

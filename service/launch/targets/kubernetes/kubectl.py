@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import yaml
 from pydantic import JsonValue
 
-from t6gps.service.launch.kubernetes.pods import Manifest
+from t6gps.service.launch.targets.kubernetes.pods import Manifest
 from t6gps.storage.errors import RunError
 
 ANSWER_S, REQUEST_S = 120.0, 20
