@@ -165,10 +165,7 @@ class Client:
             raise self._server.nonsense(error) from None
 
     def query(self, runs: str, sql: str, /, **parameters: Parameter) -> pa.Table:
-        """The result of one SELECT over a run, or over those that match a pattern such as 'rough-*'.
-
-        RunError where one of those is damaged.
-        """
+        """The result of one SELECT over a run, or over those that match a pattern. RunError where one is damaged."""
         sink = io.BytesIO()
         self.write(runs, sql, QueryForm.ARROW, sink, parameters, _refuse)
         return self._server.table(sink.getvalue())
@@ -183,15 +180,15 @@ class Client:
 
     def write(self, runs: str, sql: str, form: str, sink: BinaryIO, parameters: Parameters, warn: Warn) -> None:
         """Write such a result as arrow (an IPC stream), parquet, csv or json. `warn` is told of runs left out."""
-        request = _question(runs, sql, form, parameters)
-        for chunk in self._server.chunks("/query", request, warn):
+        for chunk in self._server.chunks("/query", _question(runs, sql, form, parameters), warn):
             sink.write(chunk)
         sink.flush()
 
     def head(self, runs: str, sql: str, parameters: Parameters, warn: Warn) -> Head:
         """The first rows of such a result, as texts for people."""
-        request = _question(runs, sql, QueryForm.HEAD, parameters)
-        return self._server.read(b"".join(self._server.chunks("/query", request, warn)), Head)
+        sink = io.BytesIO()
+        self.write(runs, sql, QueryForm.HEAD, sink, parameters, warn)
+        return self._server.read(sink.getvalue(), Head)
 
     def events(self, name: str, last: str = START) -> Iterator[Update]:
         """What happens to a run after the update whose id is `last`, until the connection ends. ServerError then."""
