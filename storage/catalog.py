@@ -17,6 +17,7 @@ from __future__ import annotations
 import difflib
 import errno
 import fcntl
+import fnmatch
 import itertools
 import os
 import re
@@ -38,6 +39,7 @@ GLANCE_S = 0.5
 """Somebody who only looks whether a run is in use holds its lock for less."""
 NO_FILES: Mapping[str, bytes] = MappingProxyType({})
 _EVALUATING = ".evaluating"
+_WILD = frozenset("*?[")
 _NAME = re.compile(r"[A-Za-z0-9][A-Za-z0-9._-]*", re.ASCII)
 
 
@@ -233,6 +235,29 @@ def open_run(root: Path, name: str) -> Run:
     closest = difflib.get_close_matches(name, names, n=1)
     hint = f"did you mean {closest[0]!r}? " if closest else ""
     raise RunError(f"there is no run {name!r} in {root}; {hint}runs: {', '.join(names)}")
+
+
+def matching(root: Path, pattern: str) -> list[Run]:
+    """The runs under `root` whose names match a shell pattern such as 'rough-*', by name.
+
+    RunError where none does, with the closest names. A name stands for itself alone, and is refused as by `open_run`.
+    """
+    if not is_pattern(pattern):
+        return [open_run(root, pattern)]
+    runs = list_runs(root)
+    found = [run for run in runs if fnmatch.fnmatchcase(run.name, pattern)]
+    if not found:
+        names = [run.name for run in runs]
+        closest = difflib.get_close_matches(pattern, names, n=3, cutoff=0.4)
+        hint = f"the closest: {', '.join(closest)}; " if closest else ""
+        listed = f"{hint}runs: {', '.join(names)}" if names else "it holds no runs"
+        raise RunError(f"no run in {whole(root)} matches {pattern!r}; {listed}")
+    return found
+
+
+def is_pattern(name: str) -> bool:
+    """True for what may stand for many runs: it has '*', '?' or '['."""
+    return not _WILD.isdisjoint(name)
 
 
 def exists(root: Path, name: str) -> bool:

@@ -31,6 +31,9 @@ def _schema(*fields: pa.Field) -> pa.Schema:
     return pa.schema(fields, {"t6gps_schema_version": str(SCHEMA_VERSION)})
 
 
+RUN = scalar("run", pa.string(), "", "name of the run")
+"""The first column of every table in a query over runs; in the files of a run it does not stand."""
+
 FRAMES = _schema(
     scalar("episode_id", pa.int64(), "1", "episode, unique in the run"),
     scalar("iteration", pa.int32(), "1", "iteration of the run that sampled the episode"),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 
 import numpy as np
 import pyarrow as pa
@@ -21,12 +21,12 @@ def committed_iterations(run: Run) -> int:
     return iterations.committed(run)
 
 
-def files(run: Run) -> dict[str, Files]:
-    """The Parquet files of all tables. DataError where a table or a file is missing or damaged."""
+def files(run: Run, names: Collection[str] = schema.TABLES.keys()) -> dict[str, Files]:
+    """The Parquet files of tables, by default of all. DataError where one of them is missing or damaged."""
     iterations_n, evaluated = iterations.committed(run), log.opened(run, "evaluations")
     return {
-        **{name: iterations.files(run, name, iterations_n) for name in schema.OF_ITERATIONS},
-        **{name: evaluations.files(run, name, evaluated) for name in schema.OF_EVALUATIONS},
+        **{name: iterations.files(run, name, iterations_n) for name in schema.OF_ITERATIONS if name in names},
+        **{name: evaluations.files(run, name, evaluated) for name in schema.OF_EVALUATIONS if name in names},
     }
 
 

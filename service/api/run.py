@@ -11,6 +11,8 @@ import pyarrow as pa
 import pyarrow.compute as pc
 
 from t6gps.service import config as configuration
+from t6gps.service.api import asking
+from t6gps.service.api.asking import Parameter
 from t6gps.service.api.policy import Policy
 from t6gps.service.config import Config
 from t6gps.service.steering import events, requests, status
@@ -47,12 +49,12 @@ class Run:
         """What its last policy did without noise; None before the training has ended."""
         return evaluation.kept(self._folder)
 
-    def query(self, sql: str) -> pa.Table:
-        """The result of one SELECT over its tables (docs/data.md).
+    def query(self, sql: str, /, **parameters: Parameter) -> pa.Table:
+        """The result of one SELECT over its tables (docs/queries.md), with values for the SQL's $names.
 
         Only committed iterations are seen. QueryError for SQL that is refused, wrong, or takes too much.
         """
-        return query(self._folder, sql)
+        return query(asking.of_run(self._folder, sql, parameters))
 
     def table(self, name: str, columns: list[str] | None = None, where: pc.Expression | None = None) -> pa.Table:
         """The committed rows of a table, bit for bit; units are in the metadata of its fields.

@@ -9,6 +9,7 @@ from typing import TYPE_CHECKING, BinaryIO, Protocol
 
 import pyarrow as pa
 
+from t6gps.service.api.asking import Parameters, Warn
 from t6gps.service.cli.here import Here
 from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import Source
@@ -56,9 +57,9 @@ class Door(Protocol):
 
     def evaluation(self, name: str) -> Evaluation | None: ...
 
-    def head(self, name: str, sql: str) -> Head: ...
+    def head(self, runs: str, sql: str, parameters: Parameters, warn: Warn) -> Head: ...
 
-    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None: ...
+    def write(self, runs: str, sql: str, parameters: Parameters, form: str, sink: BinaryIO, warn: Warn) -> None: ...
 
     def source(self, name: str) -> AbstractContextManager[tuple[Source, str]]: ...
 

@@ -9,6 +9,7 @@ from typing import BinaryIO, cast, final
 
 import pyarrow as pa
 
+from t6gps.service.api.asking import Parameters, Warn
 from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import Source
 from t6gps.service.remote import following, source
@@ -74,7 +75,9 @@ class Far:
 
     def episode(self, name: str, number: int, evaluation: int | None) -> Episode:
         frames = self.client.episode(name, number)
-        return Episode(frames, self.client.query(name, f"SELECT * FROM episodes WHERE episode_id = {number}"))
+        return Episode(
+            frames, self.client.query(name, f"SELECT * EXCLUDE (run) FROM episodes WHERE episode_id = {number}")
+        )
 
     def policy(self, name: str, version: int | None) -> PolicySnapshot:
         chosen = policies.chosen_of(name, self.client.versions(name), version)
@@ -83,11 +86,11 @@ class Far:
     def evaluation(self, name: str) -> Evaluation | None:
         return self.client.evaluation(name)
 
-    def head(self, name: str, sql: str) -> Head:
-        return self.client.head(name, sql)
+    def head(self, runs: str, sql: str, parameters: Parameters, warn: Warn) -> Head:
+        return self.client.head(runs, sql, parameters, warn)
 
-    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
-        self.client.write(name, sql, form, sink)
+    def write(self, runs: str, sql: str, parameters: Parameters, form: str, sink: BinaryIO, warn: Warn) -> None:
+        self.client.write(runs, sql, form, sink, parameters, warn)
 
     def source(self, name: str) -> AbstractContextManager[tuple[Source, str]]:
         return nullcontext((FarSource(self.client, name), name))

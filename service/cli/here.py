@@ -10,6 +10,8 @@ from typing import BinaryIO, final
 
 import pyarrow as pa
 
+from t6gps.service.api import asking
+from t6gps.service.api.asking import Parameters, Warn
 from t6gps.service.launch import control, launchers
 from t6gps.service.launch import job as records
 from t6gps.service.launch.control import JobLine, Standing
@@ -99,13 +101,13 @@ class Here:
         """What the last policy did without noise; None before the training has ended."""
         return evaluation.kept(self._run(name))
 
-    def head(self, name: str, sql: str) -> Head:
-        """The first rows of the result of one SELECT."""
-        return query.head(self._run(name), sql)
+    def head(self, runs: str, sql: str, parameters: Parameters, warn: Warn) -> Head:
+        """The first rows of the result of one SELECT over a run, or over those that match a pattern."""
+        return query.head(asking.question(self.root, runs, sql, parameters, warn))
 
-    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
-        """Write the result of one SELECT as arrow, csv or json."""
-        query.write(self._run(name), sql, form, sink)
+    def write(self, runs: str, sql: str, parameters: Parameters, form: str, sink: BinaryIO, warn: Warn) -> None:
+        """Write the result of such a SELECT as arrow, parquet, csv or json."""
+        query.write(asking.question(self.root, runs, sql, parameters, warn), form, sink)
 
     @contextmanager
     def source(self, name: str) -> Iterator[tuple[Source, str]]:

@@ -19,6 +19,7 @@ import pyarrow as pa
 from pydantic import JsonValue
 
 from t6gps.service import config as configuration
+from t6gps.service.api.asking import Parameter, Parameters, Warn
 from t6gps.service.api.policy import Policy
 from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import File
@@ -42,6 +43,7 @@ from t6gps.service.steering.status import Status
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
 from t6gps.storage import catalog
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.storage.sql.query import Head
 
@@ -162,10 +164,10 @@ class Client:
         except (ValueError, KeyError, OSError) as error:
             raise self._server.nonsense(error) from None
 
-    def query(self, name: str, sql: str) -> pa.Table:
-        """The result of one SELECT."""
+    def query(self, runs: str, sql: str, /, **parameters: Parameter) -> pa.Table:
+        """The result of one SELECT over a run, or over those that match a pattern. RunError where one is damaged."""
         sink = io.BytesIO()
-        self.write(name, sql, QueryForm.ARROW, sink)
+        self.write(runs, sql, QueryForm.ARROW, sink, parameters, _refuse)
         return self._server.table(sink.getvalue())
 
     def episode(self, name: str, number: int) -> pa.Table:
@@ -174,17 +176,19 @@ class Client:
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""
-        return self.query(name, f"SELECT * FROM {table} ORDER BY iteration")
+        return self.query(name, f"SELECT * EXCLUDE (run) FROM {table} ORDER BY iteration")
 
-    def write(self, name: str, sql: str, form: str, sink: BinaryIO) -> None:
-        """Write the result of one SELECT as arrow (an IPC stream), csv or json."""
-        for chunk in self._server.chunks(f"{_run(name)}/query", checked(QueryRequest, sql=sql, form=form)):
+    def write(self, runs: str, sql: str, form: str, sink: BinaryIO, parameters: Parameters, warn: Warn) -> None:
+        """Write such a result as arrow (an IPC stream), parquet, csv or json. `warn` is told of runs left out."""
+        for chunk in self._server.chunks("/query", _question(runs, sql, form, parameters), warn):
             sink.write(chunk)
         sink.flush()
 
-    def head(self, name: str, sql: str) -> Head:
-        """The first rows of the result of one SELECT, as texts for people."""
-        return self._server.post(f"{_run(name)}/query", Head, checked(QueryRequest, sql=sql, form=QueryForm.HEAD))
+    def head(self, runs: str, sql: str, parameters: Parameters, warn: Warn) -> Head:
+        """The first rows of such a result, as texts for people."""
+        sink = io.BytesIO()
+        self.write(runs, sql, QueryForm.HEAD, sink, parameters, warn)
+        return self._server.read(sink.getvalue(), Head)
 
     def events(self, name: str, last: str = START) -> Iterator[Update]:
         """What happens to a run after the update whose id is `last`, until the connection ends. ServerError then."""
@@ -204,6 +208,15 @@ def _policy(archive: bytes, version: int) -> Policy:
         layers_n = sum(key.startswith("weight_") for key in arrays.files)
         layers = tuple((arrays[f"weight_{k}"], arrays[f"bias_{k}"]) for k in range(layers_n))
         return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
+
+
+def _question(runs: str, sql: str, form: str, parameters: Parameters) -> QueryRequest:
+    pattern = runs if catalog.is_pattern(runs) else catalog.check_name(runs)
+    return checked(QueryRequest, runs=pattern, sql=sql, form=form, parameters=dict(parameters))
+
+
+def _refuse(warning: str) -> None:
+    raise RunError(f"{warning}; name the other runs")
 
 
 def _run(name: str) -> str:

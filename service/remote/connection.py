@@ -7,7 +7,7 @@ those of SSL_CERT_FILE.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 from typing import TypeVar, final
 
@@ -15,7 +15,7 @@ import httpx
 import pyarrow as pa
 from pydantic import BaseModel, JsonValue, TypeAdapter, ValidationError
 
-from t6gps.service.remote.messages import WAIT_S, Refusal
+from t6gps.service.remote.messages import WAIT_S, WARNINGS, Refusal
 from t6gps.service.remote.stream import Update, parsed
 from t6gps.storage.errors import (
     CheckpointError,
@@ -64,11 +64,11 @@ class Connection:
 
     def get(self, path: str, kind: type[T]) -> T:
         """What is there, as an object of a kind."""
-        return self._read(self.ask("GET", path), kind)
+        return self.read(self.ask("GET", path), kind)
 
     def post(self, path: str, kind: type[T], request: BaseModel | None = None) -> T:
         """What the server makes of a request, as an object of a kind."""
-        return self._read(self.ask("POST", path, request), kind)
+        return self.read(self.ask("POST", path, request), kind)
 
     def ask(self, method: str, path: str, request: BaseModel | None = None) -> bytes:
         """The body of an answer."""
@@ -80,9 +80,11 @@ class Connection:
         self._check(answer)
         return answer.content
 
-    def chunks(self, path: str, request: BaseModel) -> Iterator[bytes]:
-        """The body of an answer to a request, as it comes."""
+    def chunks(self, path: str, request: BaseModel, warn: Callable[[str], object]) -> Iterator[bytes]:
+        """The body of an answer to a request, as it comes, after its warnings."""
         with self._streamed("POST", path, json=request.model_dump(mode="json")) as answer:
+            for warning in self.read(answer.headers.get(WARNINGS, "[]").encode(), list[str]):
+                warn(warning)
             yield from answer.iter_bytes()
 
     def pieces(self, path: str, offset: int) -> Iterator[bytes]:
@@ -140,7 +142,8 @@ class Connection:
             ) from None
         raise KINDS.get(refusal.kind, ServerError)(refusal.error)
 
-    def _read(self, content: bytes, kind: type[T]) -> T:
+    def read(self, content: bytes, kind: type[T]) -> T:
+        """What an answer says, as an object of a kind."""
         try:
             return TypeAdapter(kind).validate_json(content)
         except ValidationError as error:

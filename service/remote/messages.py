@@ -13,11 +13,15 @@ from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.storage.catalog import NAME_LENGTH_N
 from t6gps.storage.sql.query import SQL_BYTES_N
 
+WARNINGS = "T6GPS-Warnings"
+"""The header that says of an answer what it is without: a list in JSON."""
 WAIT_S = 60.0
 """The longest that a request may wait for its effect."""
 LIFETIME_DAYS_MOST = 366.0
 
 RunName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
+Pattern = Annotated[str, StringConstraints(min_length=1, max_length=NAME_LENGTH_N)]
+ParameterName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
 TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]*$")]
 Preset = Annotated[str, WithJsonSchema({"type": "string", "enum": presets()})]
 Key = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z_]+(\.[a-z_]+)+$")]
@@ -111,15 +115,18 @@ class QueryForm(StrEnum):
     """Forms of a query's result; a head is the first rows as texts for people."""
 
     ARROW = "arrow"
+    PARQUET = "parquet"
     CSV = "csv"
     JSON = "json"
     HEAD = "head"
 
 
 class QueryRequest(Message):
-    """One SELECT, and the form of its result."""
+    """One SELECT over a run, or over those that match a pattern, with values of its $names; the form of its result."""
 
+    runs: Pattern
     sql: Annotated[str, StringConstraints(max_length=SQL_BYTES_N)]
+    parameters: dict[ParameterName, Scalar | list[Scalar]] = Field(default={}, max_length=100)
     form: Annotated[QueryForm, Field(strict=False)] = QueryForm.ARROW
 
 

@@ -49,6 +49,7 @@ def create(
     for routes in (
         reading.routes,
         stored.routes,
+        stored.asking,
         jobs.routes,
         operating.routes,
         administering.routes,

@@ -33,7 +33,7 @@ from t6gps.service.views.run_figures import (
     numbers,
 )
 from t6gps.storage import tables
-from t6gps.storage.sql.query import query
+from t6gps.storage.sql.query import Question, query
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures import render
@@ -102,7 +102,9 @@ def ground_track(finished: Sequence[Finished]) -> Figure:
 
 def largest_climb(finished: Sequence[Finished]) -> Climb:
     """The largest height gain among the stored episodes of all runs."""
-    tops = [(query(outcome.run, LARGEST_CLIMBS).slice(0, 1).to_pylist()[0], outcome) for outcome in finished]
+    tops = [
+        (query(Question([outcome.run], LARGEST_CLIMBS)).slice(0, 1).to_pylist()[0], outcome) for outcome in finished
+    ]
     best, outcome = max(tops, key=lambda item: item[0]["gain_m"])
     frames = tables.episode(outcome.run, best["episode_id"]).frames.sort_by("step")
     row = tables.read(outcome.run, "episodes", filter=pc.field("episode_id") == best["episode_id"]).to_pylist()[0]
@@ -186,7 +188,7 @@ def climb(finished: Sequence[Finished]) -> Figure:
 
 def climbs(finished: Sequence[Finished]) -> Figure:
     """How large the largest climbs of the episodes are, and the share that reaches two thirds of a bar."""
-    gains = np.concatenate([numbers(query(outcome.run, LARGEST_CLIMBS), "gain_m") for outcome in finished])
+    gains = np.concatenate([numbers(query(Question([outcome.run], LARGEST_CLIMBS)), "gain_m") for outcome in finished])
     with rc_context(STYLE):
         figure = canvas(7, 3.6)
         axes = figure.subplots()
@@ -209,11 +211,11 @@ def any_axis(finished: Sequence[Finished]) -> Figure:
     """
     finished = [outcome for outcome in finished if outcome.trial.arm == finished[0].trial.arm]
     sql = f"SELECT kind, com_velocity[1] AS vx, com_velocity[2] AS vy FROM frames WHERE {LATE}"
-    rows = pa.concat_tables([query(outcome.run, sql) for outcome in finished])
+    rows = pa.concat_tables([query(Question([outcome.run], sql)) for outcome in finished])
     velocity = np.column_stack([numbers(rows, "vx"), numbers(rows, "vy")])
     kind, moving = numbers(rows, "kind"), np.hypot(*velocity.T) > MOVING_M_PER_S
     angle_deg = np.degrees(np.arctan2(velocity[:, 1], velocity[:, 0]))
-    crossings = pa.concat_tables([query(outcome.run, TRANSITIONS) for outcome in finished]).group_by(
+    crossings = pa.concat_tables([query(Question([outcome.run], TRANSITIONS)) for outcome in finished]).group_by(
         ["kind", "entry_edge", "exit_edge"]
     )
     counts = crossings.aggregate([("transitions", "sum")]).sort_by([(name, "ascending") for name in ORDER])
@@ -262,7 +264,7 @@ def grades(finished: Sequence[Finished]) -> Figure:
 def _rises(outcome: Finished) -> tuple[Array, Array]:
     """Rise of the ground towards the waypoint (deg) and speed towards it (m/s), row by row."""
     columns = "episode_id, com_x_m, com_y_m, waypoint_x_m, waypoint_y_m, forward_speed_m_per_s"
-    rows = query(outcome.run, f"SELECT {columns} FROM frames WHERE {LATE} ORDER BY episode_id, step")
+    rows = query(Question([outcome.run], f"SELECT {columns} FROM frames WHERE {LATE} ORDER BY episode_id, step"))
     place = np.column_stack([numbers(rows, "com_x_m"), numbers(rows, "com_y_m")])
     ahead = np.column_stack([numbers(rows, "waypoint_x_m"), numbers(rows, "waypoint_y_m")]) - place
     ahead /= np.maximum(np.linalg.norm(ahead, axis=1, keepdims=True), 1e-9)

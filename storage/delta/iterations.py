@@ -95,7 +95,7 @@ def files(run: Run, table: str, iterations_n: int) -> Files:
         raise log.damaged(run, table, f"its log has {len(found)} of {max(iterations_n, committed_n)} iterations")
     if committed_n > iterations_n + 1 and committed(run) == iterations_n:
         raise log.damaged(run, "episodes", f"its log has {iterations_n} of {committed_n - 1} iterations or more")
-    return Files(found, iterations_n)
+    return Files(found, iterations_n if committed_n > iterations_n else None)
 
 
 def _younger(run: Run, table: str) -> bool:

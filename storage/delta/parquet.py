@@ -2,13 +2,14 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
+import pyarrow.fs
 import pyarrow.parquet as pq
 
 from t6gps.storage import durable, schema
@@ -21,7 +22,7 @@ _VERIFIED = ds.ParquetFileFormat(
 
 @dataclass(frozen=True)
 class Files:
-    """Files of a table; with `iterations_n` those rows alone that earlier iterations have left."""
+    """Files of a table; with `iterations_n` those rows alone that earlier iterations have left, else all."""
 
     paths: list[str]
     iterations_n: int | None = None
@@ -75,10 +76,31 @@ def rows(table: str, files: Files) -> ds.Dataset:
     if not files.paths:
         return ds.dataset(definition.empty_table())
     found = ds.dataset(files.paths, definition, format=_VERIFIED)
-    if files.iterations_n is None:
-        return found
-    seen = pc.field("iteration") < files.iterations_n
-    return found.filter(seen | pc.field("iteration").is_null() if definition.field("iteration").nullable else seen)
+    return found if files.iterations_n is None else found.filter(_seen(definition, files.iterations_n))
+
+
+def rows_of_runs(table: str, files: Mapping[str, Files]) -> ds.Dataset:
+    """The rows of files of many runs, by the runs' names, lazily, with the column `run` before the others."""
+    definition = pa.schema([schema.RUN, *schema.TABLES[table]])
+    paths = [(path, pc.field("run") == run) for run, found in files.items() for path in found.paths]
+    if not paths:
+        return ds.dataset(definition.empty_table())
+    rows = ds.FileSystemDataset.from_paths(
+        [path for path, _ in paths],
+        schema=definition,
+        format=_VERIFIED,
+        filesystem=pyarrow.fs.LocalFileSystem(),
+        partitions=[of_run for _, of_run in paths],
+    )
+    for run, found in files.items():
+        if found.iterations_n is not None:
+            rows = rows.filter((pc.field("run") != run) | _seen(definition, found.iterations_n))
+    return rows
+
+
+def _seen(definition: pa.Schema, iterations_n: int) -> pc.Expression:
+    seen = pc.field("iteration") < iterations_n
+    return seen | pc.field("iteration").is_null() if definition.field("iteration").nullable else seen
 
 
 def version(file: str) -> int:

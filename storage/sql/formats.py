@@ -1,4 +1,4 @@
-"""How an answer leaves the process of its query: as Arrow, CSV or JSON, or its head as text for people.
+"""How an answer leaves the process of its query: as Arrow, Parquet, CSV or JSON, or its head as text for people.
 
 DuckDB turns values into text, so each of its types has one. The rows pass in batches, and no more than one batch of
 them is held. Of two columns with one name, the second gets a number: a, a_1.
@@ -13,11 +13,13 @@ from typing import BinaryIO
 import duckdb
 import pyarrow as pa
 import pyarrow.csv
+import pyarrow.parquet
 from duckdb.sqltypes import DuckDBPyType
 
 from t6gps.storage.errors import QueryError
 
-BATCH_ROWS_N = 8192
+BATCH_ROWS_N, GROUP_ROWS_N = 8192, 32768
+"""Rows of a batch, and of a row group of Parquet."""
 HEAD_ROWS_N, HEAD_ITEMS_N, HEAD_CHARACTERS_N = 40, 3, 48
 """Rows of a head, items of its lists and characters of its texts."""
 
@@ -38,13 +40,25 @@ def write(relation: duckdb.DuckDBPyRelation, form: str, sink: BinaryIO) -> None:
 
 def _arrow(relation: duckdb.DuckDBPyRelation, sink: BinaryIO) -> None:
     """An Arrow IPC stream."""
-    for name, kind in zip(relation.columns, relation.types, strict=True):
-        if found := _NOT_IN_ARROW.search(str(kind)):
-            raise QueryError(f"Arrow has no {found[0]}, the type of column {name}; cast it, for example to VARCHAR")
-    reader = relation.to_arrow_reader(BATCH_ROWS_N)
+    reader = _batches(relation, BATCH_ROWS_N)
     with pa.ipc.new_stream(sink, reader.schema) as stream:
         for batch in reader:
             stream.write_batch(batch)
+
+
+def _parquet(relation: duckdb.DuckDBPyRelation, sink: BinaryIO) -> None:
+    """A Parquet file, compressed with zstd, whose pages carry sums."""
+    reader = _batches(relation, GROUP_ROWS_N)
+    with pyarrow.parquet.ParquetWriter(sink, reader.schema, compression="zstd", write_page_checksum=True) as file:
+        for batch in reader:
+            file.write_batch(batch)
+
+
+def _batches(relation: duckdb.DuckDBPyRelation, rows_n: int) -> pa.RecordBatchReader:
+    for name, kind in zip(relation.columns, relation.types, strict=True):
+        if found := _NOT_IN_ARROW.search(str(kind)):
+            raise QueryError(f"Arrow has no {found[0]}, the type of column {name}; cast it, for example to VARCHAR")
+    return relation.to_arrow_reader(rows_n)
 
 
 def _csv(relation: duckdb.DuckDBPyRelation, sink: BinaryIO) -> None:
@@ -126,4 +140,4 @@ def _quoted(name: str) -> str:
     return '"' + name.replace('"', '""') + '"'
 
 
-FORMS = {"arrow": _arrow, "csv": _csv, "json": _json, "head": _head}
+FORMS = {"arrow": _arrow, "parquet": _parquet, "csv": _csv, "json": _json, "head": _head}

@@ -1,4 +1,4 @@
-"""SQL over the tables of a run, safe for questions from strangers.
+"""SQL over the tables of runs, safe for questions from strangers.
 
 DuckDB runs in a child process (`sandbox`) that sees the tables and nothing else: no files, no network,
 no settings; one SELECT, bounded in length, nesting, memory, time and result.
@@ -6,6 +6,7 @@ no settings; one SELECT, bounded in length, nesting, memory, time and result.
 
 from __future__ import annotations
 
+import io
 import json
 import mmap
 import os
@@ -13,18 +14,22 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass
-from typing import BinaryIO
+from dataclasses import asdict, dataclass, field
+from typing import BinaryIO, TypeAlias
 
 import pyarrow as pa
 
-from t6gps.storage import tables
+from t6gps.storage import schema, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.delta import log
-from t6gps.storage.errors import QueryError
-from t6gps.storage.sql import sandbox
+from t6gps.storage.delta import log, parquet
+from t6gps.storage.delta.parquet import Files
+from t6gps.storage.errors import DataError, QueryError, T6GpsError
+from t6gps.storage.sql import sandbox, views
+
+RunFiles: TypeAlias = dict[str, Files]
+"""The files of a table by the names of runs."""
 
 SQL_BYTES_N = 64 * 1024
 BRACKET_DEPTH_N = 100
@@ -53,63 +58,139 @@ class Head:
     shortened: bool
 
 
-def query(run: Run, sql: str, *, timeout_s: float = 30.0) -> pa.Table:
-    """The result of one SELECT over the tables of `run`.
+@dataclass(frozen=True)
+class About:
+    """What the table `runs` says: its columns, those of views.RUNS among them, and the row of a run."""
+
+    columns: pa.Schema
+    row: Callable[[Run], Mapping[str, object]]
+
+
+@dataclass(frozen=True)
+class Question:
+    """One SELECT over the tables of runs, and over the views on them (views.asked).
+
+    parameters   values of its $names: numbers, texts, flags, or lists of them
+    about        what is said of runs; their names alone by default
+    left_out     is told of each run that is damaged, which the answer then is without; by default it is an error
+    """
+
+    runs: Sequence[Run]
+    sql: str
+    parameters: Mapping[str, object] = field(default_factory=dict)
+    about: About = About(views.RUNS, lambda run: {"run": run.name})
+    left_out: Callable[[str], object] | None = None
+    timeout_s: float = 30.0
+
+
+def query(question: Question) -> pa.Table:
+    """The result of a question; each table has the column `run` first.
 
     Only committed iterations are seen. Of two columns with one name, the second gets a number: cost, cost_1. Raises
-    DataError for a run that is not whole. QueryError, with DuckDB's own sentence first where there is one, for SQL that
-    is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of 1 GB or `timeout_s`
-    seconds.
+    DataError where a table that the SQL names is not whole. QueryError, with DuckDB's own sentence first where there is
+    one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of
+    1 GB or the question's seconds.
     """
-    with _answer(run, sql, "arrow", timeout_s) as result:
+    with _answer(question, "arrow") as result:
         return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
 
 
-def write(run: Run, sql: str, form: str, sink: BinaryIO, *, timeout_s: float = 30.0) -> None:
-    """Write what `query` would return as arrow (an IPC stream), csv or json, once the whole result is there.
+def write(question: Question, form: str, sink: BinaryIO) -> None:
+    """Write what `query` would return in a form of formats.FORMS, once the whole result is there.
 
-    Its size is that of a file, not of memory. Raises QueryError as `query` does; nothing is written then.
+    Its size is that of a file, not of memory. Raises errors as `query` does; nothing is written then.
     """
-    with _answer(run, sql, form, timeout_s) as result:
+    with _answer(question, form) as result:
         shutil.copyfileobj(result, sink)
     sink.flush()
 
 
-def head(run: Run, sql: str, *, timeout_s: float = 30.0) -> Head:
-    """The first rows of what `query` would return. Raises QueryError as `query` does; the result has no bound."""
-    with _answer(run, sql, "head", timeout_s) as result:
+def head(question: Question) -> Head:
+    """The first rows of what `query` would return. Raises errors as `query` does; the result has no bound."""
+    with _answer(question, "head") as result:
         return Head(**json.load(result))
 
 
 @contextmanager
-def _answer(run: Run, sql: str, form: str, timeout_s: float) -> Iterator[BinaryIO]:
+def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
     """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
-    _check_size(sql)
-    files = {table: asdict(found) for table, found in tables.files(run).items()}
-    question = {"sql": sql, "form": form, "files": files, "timeout_s": timeout_s}
+    _check_size(question.sql)
+    files, about = _read(question)
     with tempfile.TemporaryFile() as result:
         try:
             child = subprocess.run(
                 [sys.executable, "-P", "-m", sandbox.__name__],
-                input=json.dumps(question).encode(),
+                input=_line(question, form, files) + _stream(about),
                 stdout=result,
                 stderr=subprocess.PIPE,
                 env={**os.environ, **_ENVIRONMENT},
-                timeout=timeout_s,
+                timeout=question.timeout_s,
                 check=False,
             )
         except subprocess.TimeoutExpired as error:
             raise QueryError(
-                f"the query was stopped after {timeout_s:g} s; ask for fewer rows or columns, filter by "
+                f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
                 "iteration, or read the Parquet files directly"
             ) from error
         if child.returncode:
             message = child.stderr.decode(errors="replace").strip()
             if child.returncode == sandbox.DAMAGED:
-                raise log.damaged(run, *json.loads(message))
+                raise _damaged(question.runs, files, *json.loads(message))
             raise QueryError(_reason(child.returncode, message))
         result.seek(0)
         yield result
+
+
+def _read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
+    """Of each table the files that the question may read, by run; and the table `runs`."""
+    named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
+    of_files, rows = named - {"runs"}, []
+    if of_files:
+        of_files.add("frames")  # which is committed first, and so shows what `episodes` has lost
+    for run in question.runs:
+        try:
+            found = tables.files(run, of_files) if of_files else {}
+            row = question.about.row(run) if "runs" in named else None
+        except T6GpsError as error:
+            if question.left_out is None:
+                raise
+            question.left_out(str(error))
+            continue
+        for table, of_run in found.items():
+            files[table][run.name] = of_run
+        if row is not None:
+            rows.append(row)
+    return files, pa.Table.from_pylist(rows, question.about.columns)
+
+
+def _line(question: Question, form: str, files: Mapping[str, RunFiles]) -> bytes:
+    sent = {
+        "sql": question.sql,
+        "parameters": dict(question.parameters),
+        "form": form,
+        "files": {table: {run: asdict(found) for run, found in of_runs.items()} for table, of_runs in files.items()},
+        "timeout_s": question.timeout_s,
+    }
+    return json.dumps(sent).encode() + b"\n"
+
+
+def _stream(table: pa.Table) -> bytes:
+    sink = io.BytesIO()
+    with pa.ipc.new_stream(sink, table.schema) as stream:
+        stream.write_table(table)
+    return sink.getvalue()
+
+
+def _damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
+    """The error for a table that cannot be read to its end. It names the run, which the query's process cannot."""
+    for run in runs:
+        try:
+            with log.readable(run, table):
+                for _ in parquet.rows(table, files[table].get(run.name, Files([]))).to_batches():
+                    pass
+        except DataError as error:
+            return error
+    return log.damaged(runs[0], table, why)
 
 
 def _check_size(sql: str) -> None:

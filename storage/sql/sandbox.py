@@ -1,7 +1,8 @@
-"""The child process of `query`: one SELECT over the tables of a run, with everything else locked away.
+"""The child process of `query`: one SELECT over the tables of runs, with everything else locked away.
 
-It takes a question as JSON from its standard input, writes the result to its standard output in the form that is
-asked for (`formats`), and says on its standard error why it refused. Only DuckDB and pyarrow are loaded, and pandas
+It takes a question from its standard input, a line of JSON and then the table of runs as an Arrow IPC stream. It writes
+the result to its standard output in the form that is asked for (`formats`), and says on its standard error why it
+refused. Only DuckDB and pyarrow are loaded, and pandas
 where somebody installed it, since pyarrow.dataset then imports it: it starts in a fraction of a second.
 """
 
@@ -15,14 +16,14 @@ import resource
 import sys
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any
+from typing import Any, BinaryIO
 
 import duckdb
 import pyarrow as pa
 
 from t6gps.storage.delta import parquet
 from t6gps.storage.errors import QueryError
-from t6gps.storage.sql import advice, formats
+from t6gps.storage.sql import advice, formats, views
 
 RESULT_BYTES_N = 10**9
 MEMORY_BYTES_N = 2 * 1024**3
@@ -55,34 +56,49 @@ def _limit(timeout_s: float) -> None:
         resource.setrlimit(kind, (least, least))
 
 
-def _relation(question: Mapping[str, Any]) -> duckdb.DuckDBPyRelation:
+def _relation(question: Mapping[str, Any], runs: pa.Table) -> duckdb.DuckDBPyRelation:
     connection = duckdb.connect(":memory:")
     for table, files in question["files"].items():
-        connection.register(table, parquet.rows(table, parquet.Files(**files)))
+        of_runs = {run: parquet.Files(**found) for run, found in files.items()}
+        connection.register(table, parquet.rows_of_runs(table, of_runs))
+    connection.register("runs", runs)
+    connection.register("columns", views.described(views.asked(runs.schema)))
+    for name, view in views.VIEWS.items():
+        connection.execute(f"CREATE TEMP VIEW {name} AS {view.sql}")
     for setting in _SETTINGS:
         connection.execute(setting)
     _limit(question["timeout_s"])
     statements = connection.extract_statements(question["sql"])
     if [statement.type for statement in statements] != [duckdb.StatementType.SELECT]:
         raise QueryError(advice.refusal([statement.type.name for statement in statements]))
-    return connection.sql(question["sql"])
+    wanted, given = statements[0].named_parameters, question["parameters"]
+    if wanted != given.keys():
+        raise QueryError(advice.parameters(wanted, given.keys()))
+    return connection.sql(question["sql"], params=given) if given else connection.sql(question["sql"])
+
+
+def _asked(source: BinaryIO) -> tuple[dict[str, Any], pa.Table]:
+    """The question, and the table of runs."""
+    question = json.loads(source.readline())
+    with pa.ipc.open_stream(source.read()) as stream:
+        return question, stream.read_all()
 
 
 def main() -> int:
     """Answer the question on the standard input; the exit status is 0, REFUSED, TOO_LARGE or DAMAGED."""
     pa.set_cpu_count(_THREADS_N)
     pa.set_io_thread_count(_THREADS_N)
-    question = json.load(sys.stdin)
+    question, runs = _asked(sys.stdin.buffer)
     try:
         with open(sys.stdout.fileno(), "wb", closefd=False) as result:  # its last bytes may not fit either
-            formats.write(_relation(question), question["form"], result)
+            formats.write(_relation(question, runs), question["form"], result)
     except (duckdb.Error, pa.ArrowException, OSError, MemoryError, QueryError) as error:
         if isinstance(error, OSError) and error.errno == errno.EFBIG:
             return TOO_LARGE
         if fault := _FAULT.match(str(error)):
             print(json.dumps(fault.groups()), file=sys.stderr)
             return DAMAGED
-        print(advice.explained(error, question["sql"]), file=sys.stderr)
+        print(advice.explained(error, question["sql"], views.asked(runs.schema)), file=sys.stderr)
         return REFUSED
     return 0
 

@@ -16,7 +16,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import evaluations
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode
-from t6gps.storage.sql.query import query
+from t6gps.storage.sql.query import Question, query
 
 ORDER = ["evaluation_frames", "evaluation_episodes", "evaluations"]
 
@@ -48,7 +48,9 @@ def test_episodes_of_evaluations_are_kept_bit_for_bit(run: Run, commit: Any, bit
             assert bits(kept.summary.drop_columns("evaluation_id")) == bits(episode.summary.drop_columns("iteration"))
     for name in schema.OF_EVALUATIONS:
         fields.check(tables.read(run, name), schema.TABLES[name], "read")
-    counted = query(run, "SELECT evaluation_id, count(*) AS n FROM evaluation_frames GROUP BY ALL ORDER BY ALL")
+    counted = query(
+        Question([run], "SELECT evaluation_id, count(*) AS n FROM evaluation_frames GROUP BY ALL ORDER BY ALL")
+    )
     assert counted.to_pylist() == [{"evaluation_id": number, "n": 18} for number in numbers]
 
 

@@ -20,7 +20,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import iterations, policies
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
-from t6gps.storage.sql.query import query
+from t6gps.storage.sql.query import Question, query
 
 ORDER = ["frames", "classes", "models", "policies", "iterations", "episodes"]
 """In which tables are committed: an iteration is there when it stands in the last one."""
@@ -314,7 +314,7 @@ def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: st
         tables.files(run)
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="run trial is not whole"):
-        query(run, "SELECT count(*) FROM frames")
+        query(Question([run], f"SELECT count(*) FROM {table}"))
 
 
 def test_a_byte_that_has_changed_in_a_page_is_damage_and_never_an_answer(run: Run, commit: Any) -> None:
@@ -333,6 +333,6 @@ def test_a_byte_that_has_changed_in_a_page_is_damage_and_never_an_answer(run: Ru
         with pytest.raises(DataError, match=r"run trial is not whole: table frames .*restore"):
             tables.read(run, "frames")
         with pytest.raises(DataError, match="run trial is not whole"):
-            query(run, f"SELECT {name.split('.')[0]} FROM frames")
+            query(Question([run], f"SELECT {name.split('.')[0]} FROM frames"))
     file.write_bytes(whole)
     tables.read(run, "frames")

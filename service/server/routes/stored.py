@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import io
+import json
 import tempfile
+from collections.abc import Sequence
 from dataclasses import asdict
 from http import HTTPStatus
 from pathlib import Path as FilePath
@@ -14,21 +16,26 @@ import pyarrow as pa
 from fastapi import APIRouter, HTTPException, Path, Query
 from fastapi.responses import FileResponse, JSONResponse, Response, StreamingResponse
 
+from t6gps.service.api import asking as questions
 from t6gps.service.launch.fetch import File, FolderSource
-from t6gps.service.remote.messages import QueryForm, QueryRequest
-from t6gps.service.server.routes.access import REFUSALS, Answers, NamedRun, Place, Reading, contents
+from t6gps.service.remote.messages import WARNINGS, QueryForm, QueryRequest
+from t6gps.service.server.routes.access import REFUSALS, Answers, NamedRun, NoSuchRunError, Place, Reading, contents
 from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 from t6gps.storage.sql import query as sql
 
 routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS, tags=["read"])
+asking = APIRouter(dependencies=[Reading], responses=REFUSALS, tags=["read"])
+WARNINGS_N = 20
 NUMBER_MOST = 10**9
 CHUNK_BYTES_N = 2**16
 ARCHIVE = "application/octet-stream"
 MEDIA = {
     QueryForm.ARROW: "application/vnd.apache.arrow.stream",
+    QueryForm.PARQUET: "application/vnd.apache.parquet",
     QueryForm.CSV: "text/csv",
     QueryForm.JSON: "application/json",
 }
@@ -89,19 +96,31 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
     return Response(checkpoint.packed({**arrays, **weights, **biases}), media_type=ARCHIVE)
 
 
-@routes.post("/{name}/query", response_class=Response, responses=contents(MEDIA.values(), "The result."))
-def query(run: NamedRun, question: QueryRequest, place: Place) -> Response:
-    """The result of one SELECT over the tables of a run."""
-    if question.form is QueryForm.HEAD:
+@asking.post("/v1/query", response_class=Response, responses=contents(MEDIA.values(), "The result."))
+def query(request: QueryRequest, place: Place) -> Response:
+    """The result of one SELECT over a run or many. The header T6GPS-Warnings says which damaged ones it is without."""
+    warnings = list[str]()
+    try:
+        question = questions.question(place.root, request.runs, request.sql, request.parameters, warnings.append)
+    except RunError as error:
+        raise NoSuchRunError(*error.args) from None
+    if request.form is QueryForm.HEAD:
         with place.reading.taken():
-            return JSONResponse(asdict(sql.head(run, question.sql)))
+            return JSONResponse(asdict(sql.head(question)), headers=_warned(warnings))
     file = tempfile.TemporaryFile()  # noqa: SIM115 # whoever takes it slowly holds no memory, and the end closes it
     with place.reading.taken():
-        sql.write(run, question.sql, question.form, file)
-    size_n = file.tell()
+        sql.write(question, request.form, file)
+    headers = {"Content-Length": str(file.tell()), **_warned(warnings)}
     file.seek(0)
     chunks = iter(lambda: file.read(CHUNK_BYTES_N), b"")
-    return StreamingResponse(chunks, media_type=MEDIA[question.form], headers={"Content-Length": str(size_n)})
+    return StreamingResponse(chunks, media_type=MEDIA[request.form], headers=headers)
+
+
+def _warned(warnings: Sequence[str]) -> dict[str, str]:
+    """The header with warnings, as many as a header holds."""
+    told = list(warnings[:WARNINGS_N])
+    told += [f"left out: {len(warnings) - WARNINGS_N} more runs"] if len(warnings) > WARNINGS_N else []
+    return {WARNINGS: json.dumps(told)} if told else {}
 
 
 @routes.get(

@@ -77,7 +77,7 @@ def test_eval_keeps_the_episodes_of_any_policy_in_any_world(tiny: Trained, tmp_p
     assert (row["purpose"], row["policy_version"], row["seed"]) == ("eval", 1, 5)
     result = json.loads(done.stdout)
     sql = "SELECT avg(cost) AS cost FROM evaluation_episodes WHERE evaluation_id = 1"
-    assert query.query(run, sql).to_pylist() == [{"cost": pytest.approx(result["cost"]["mean"])}]
+    assert query.query(query.Question([run], sql)).to_pylist() == [{"cost": pytest.approx(result["cost"]["mean"])}]
     frames = tables.episode(run, 1, 1).frames
     assert set(frames["policy_version"].to_pylist()) == {1}
     assert frames["ground_slope_deg"].to_numpy().max() > 0

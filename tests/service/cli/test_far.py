@@ -37,6 +37,7 @@ HERE_ALONE = {
     "export": "needs no run",
     "mv": "moves folders of this machine",
     "repair": "changes folders of this machine, by copies that it sees",
+    "schema": "needs no run",
     "replay": "takes a file of this machine, which fetch brings",
     "rm": "removes folders of this machine for good",
     "serve": "is the server",
@@ -49,7 +50,11 @@ SQL = "SELECT iteration, avg(cost) AS cost FROM episodes GROUP BY iteration ORDE
 ANSWERS = {
     "runs": [[]],
     "show": [["tiny"]],
-    "query": [["tiny", SQL], *(["tiny", SQL, "--format", form] for form in ("csv", "json", "arrow"))],
+    "query": [
+        ["tiny", SQL],
+        *(["tiny", SQL, "--format", form] for form in ("csv", "json", "arrow")),
+        ["t*", "SELECT run, run_seed + $more AS n FROM runs", "--param", "more=2", "--format", "csv"],
+    ],
     "status": [["tiny"], ["tiny", "--json"], ["paused"], ["paused", "--json"]],
     "events": [["paused"], ["paused", "--json"], ["tiny"]],
     "jobs": [[], ["--json"]],
@@ -61,7 +66,7 @@ ANSWERS = {
 REFUSALS = {
     "runs": [],
     "show": [["none"], ["a/b"]],
-    "query": [["none", SQL], ["tiny", "SELEC"], ["tiny", "SELECT x"]],
+    "query": [["none", SQL], ["none*", SQL], ["tiny", "SELEC"], ["tiny", "SELECT x"], ["tiny", "SELECT $x"]],
     "status": [["none"], ["a/b"]],
     "events": [["none"]],
     "logs": [["none"], ["paused"]],

@@ -75,7 +75,7 @@ def test_a_damaged_run_is_one_clear_error_of_whoever_needs_what_is_damaged(
 ) -> None:
     spared = {
         "show": set[str](),
-        "query": {"unreadable configuration", "missing configuration", "missing ground"},
+        "query": {"unreadable configuration", "missing configuration", "missing ground", "missing table"},
         "render": {"missing table"},
         "eval": {"gap in a log", "missing table"},
     }

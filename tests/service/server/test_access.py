@@ -30,7 +30,7 @@ NEEDS = {
     ("GET", "/v1/runs/{name}/figures/{figure}"): Scope.READ,
     ("GET", "/v1/runs/{name}/policies"): Scope.READ,
     ("GET", "/v1/runs/{name}/policies/{version}"): Scope.READ,
-    ("POST", "/v1/runs/{name}/query"): Scope.READ,
+    ("POST", "/v1/query"): Scope.READ,
     ("GET", "/v1/runs/{name}/events"): Scope.READ,
     ("GET", "/v1/runs/{name}/standing"): Scope.READ,
     ("GET", "/v1/runs/{name}/logs"): Scope.READ,
@@ -171,9 +171,9 @@ def test_pages_of_other_servers_are_refused(server: Server) -> None:
 def test_a_body_that_is_too_large_is_refused_whether_its_size_is_said_or_not(serve: Callable[..., Server]) -> None:
     server = serve(Limits(body_bytes_n=1000))
     with server.http(Scope.READ) as http:
-        said = http.post("/v1/runs/walk/query", json={"sql": "-" * 2000})
-        unsaid = http.post("/v1/runs/walk/query", content=(b" " * 300 for _ in range(10)))
-        small = http.post("/v1/runs/walk/query", json={"sql": "SELECT 1"})
+        said = http.post("/v1/query", json={"runs": "walk", "sql": "-" * 2000})
+        unsaid = http.post("/v1/query", content=(b" " * 300 for _ in range(10)))
+        small = http.post("/v1/query", json={"runs": "walk", "sql": "SELECT 1"})
     assert (said.status_code, unsaid.status_code, small.status_code) == (413, 413, 200)
 
 

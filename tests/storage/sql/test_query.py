@@ -12,8 +12,8 @@ import pytest
 from t6gps.storage import catalog, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import QueryError
-from t6gps.storage.sql import sandbox
-from t6gps.storage.sql.query import query, write
+from t6gps.storage.sql import sandbox, views
+from t6gps.storage.sql.query import Question, query, write
 
 
 @pytest.fixture(scope="module")
@@ -25,12 +25,12 @@ def test_a_query_sees_what_was_committed(run: Run, commit: Any) -> None:
     commit(run, 0)
     commit(run, 1)
     episodes = tables.read(run, "episodes")
-    found = query(
-        run,
+    sql = (
         "WITH late AS (SELECT * FROM frames WHERE iteration = 1) "
         "SELECT e.episode_id, e.cost, count(*) AS n, any_value(l.nodes) AS nodes FROM late l JOIN episodes e "
-        "USING (episode_id) GROUP BY ALL ORDER BY e.episode_id",
+        "USING (episode_id) GROUP BY ALL ORDER BY e.episode_id"
     )
+    found = query(Question([run], sql))
     assert found.column("episode_id").to_pylist() == [100, 101, 102]
     assert found.column("cost").to_pylist() == episodes.column("cost").to_pylist()[3:]
     assert found.column("n").to_pylist() == [6, 6, 6]
@@ -40,24 +40,29 @@ def test_a_query_sees_what_was_committed(run: Run, commit: Any) -> None:
 def test_a_query_does_not_see_a_commit_that_was_cut_off(run: Run, commit: Any, commit_cut_off: Any) -> None:
     commit(run, 0)
     commit_cut_off(run, 1, "frames classes iterations")
-    assert query(run, "SELECT max(iteration) AS last FROM frames").to_pylist() == [{"last": 0}]
+    assert query(Question([run], "SELECT max(iteration) AS last FROM frames")).to_pylist() == [{"last": 0}]
 
 
 def test_a_run_without_iterations_has_empty_tables_with_every_column(empty: Run) -> None:
-    counts = ", ".join(f"(SELECT count(*) FROM {name}) AS {name}" for name in schema.TABLES)
-    assert query(empty, f"SELECT {counts};").to_pylist() == [dict.fromkeys(schema.TABLES, 0)]
-    listed = query(empty, "SHOW ALL TABLES").to_pylist()
+    names = [*schema.TABLES, *views.VIEWS]
+    counts = ", ".join(f"(SELECT count(*) FROM {name}) AS {name}" for name in names)
+    assert query(Question([empty], f"SELECT {counts};")).to_pylist() == [dict.fromkeys(names, 0)]
+    listed = query(Question([empty], "SHOW ALL TABLES")).to_pylist()
     assert {row["name"]: row["column_names"] for row in listed} == {
-        name: definition.names for name, definition in schema.TABLES.items()
+        name: definition.names for name, definition in views.asked().items()
     }
-    assert query(empty, "DESCRIBE frames").column("column_name").to_pylist() == schema.FRAMES.names
+    found = query(Question([empty], "DESCRIBE frames")).column("column_name").to_pylist()
+    assert found == ["run", *schema.FRAMES.names]
 
 
 @pytest.mark.parametrize(
     ("sql", "words"),
     [
-        ("SELECT cots FROM frames", ['column "cots" not found', '"cost"', "frames: episode_id"]),
-        ("SELECT e.steeps FROM Episodes e", ['column named "steeps"', "did you mean steps?", "episodes: episode_id"]),
+        ("SELECT cots FROM frames", ['column "cots" not found', '"cost"', "frames: run, episode_id"]),
+        (
+            "SELECT e.steeps FROM Episodes e",
+            ['column named "steeps"', "did you mean steps?", "episodes: run, episode_id"],
+        ),
         ("SELECT * FROM frame", ["name frame does not exist", "did you mean frames?", "frames, episodes, iterations"]),
         ("SELECT avgg(cost) FROM frames", ['Did you mean "avg"?']),
     ],
@@ -66,7 +71,7 @@ def test_a_wrong_name_is_answered_with_the_nearest_and_what_the_asked_tables_hav
     empty: Run, sql: str, words: list[str]
 ) -> None:
     with pytest.raises(QueryError) as caught:
-        query(empty, sql)
+        query(Question([empty], sql))
     for word in words:
         assert word in str(caught.value)
     assert "classes: " not in str(caught.value)
@@ -74,8 +79,8 @@ def test_a_wrong_name_is_answered_with_the_nearest_and_what_the_asked_tables_hav
 
 def test_a_pivot_is_told_to_name_its_values(empty: Run) -> None:
     with pytest.raises(QueryError, match=r"ON ended_by IN \('completed'\)"):
-        query(empty, "PIVOT episodes ON ended_by USING count(*)")
-    named = query(empty, "PIVOT episodes ON ended_by IN ('completed') USING count(*) GROUP BY iteration")
+        query(Question([empty], "PIVOT episodes ON ended_by USING count(*)"))
+    named = query(Question([empty], "PIVOT episodes ON ended_by IN ('completed') USING count(*) GROUP BY iteration"))
     assert named.column_names == ["iteration", "completed"]
 
 
@@ -83,7 +88,7 @@ def test_nothing_is_written_of_a_result_that_fails_at_its_end(empty: Run) -> Non
     sink = io.BytesIO()
     for form in ("arrow", "csv", "json"):
         with pytest.raises(QueryError, match="Conversion Error"):
-            write(empty, "SELECT if(range = 90000, 'x', '1')::INT AS n FROM range(100000)", form, sink)
+            write(Question([empty], "SELECT if(range = 90000, 'x', '1')::INT AS n FROM range(100000)"), form, sink)
     assert sink.getvalue() == b""
 
 
@@ -119,8 +124,8 @@ def test_an_attack_or_a_mistake_is_refused_with_what_is_allowed(
 ) -> None:
     file = tmp_path / "stolen"
     with pytest.raises(QueryError, match=reason) as caught:
-        query(empty, sql.replace("{file}", str(file)))
-    assert "allowed is one SELECT" in str(caught.value) or "frames: episode_id" in str(caught.value)
+        query(Question([empty], sql.replace("{file}", str(file))))
+    assert "allowed is one SELECT" in str(caught.value) or "frames: run, episode_id" in str(caught.value)
     assert not file.exists()
 
 
@@ -132,20 +137,20 @@ def test_a_query_runs_with_its_bounds_set_and_locked(empty: Run) -> None:
         "temp_directory": "",
         "threads": "2",
     }
-    found = query(empty, f"SELECT name, value FROM duckdb_settings() WHERE name IN {tuple(expected)}")
+    found = query(Question([empty], f"SELECT name, value FROM duckdb_settings() WHERE name IN {tuple(expected)}"))
     assert {row["name"]: row["value"] for row in found.to_pylist()} == expected
 
 
 def test_length_nesting_and_encoding_are_bounded_before_anything_starts(empty: Run) -> None:
     nested = "SELECT " + "(" * 100 + "1" + ")" * 100
-    assert query(empty, nested).num_rows == 1
+    assert query(Question([empty], nested)).num_rows == 1
     for sql, reason in (
         (nested.replace("1", "(1)"), "nests 101 brackets"),
         ("SELECT '" + "é" * 32768 + "'", "65545 bytes"),
         ("SELECT '\ud800'", "not valid Unicode"),
     ):
         with pytest.raises(QueryError, match=reason):
-            query(empty, sql, timeout_s=0.0)  # what starts is stopped at once
+            query(Question([empty], sql, timeout_s=0.0))  # what starts is stopped at once
 
 
 @pytest.mark.slow
@@ -158,13 +163,13 @@ def test_length_nesting_and_encoding_are_bounded_before_anything_starts(empty: R
 )
 def test_an_endless_query_is_stopped(empty: Run, sql: str) -> None:
     with pytest.raises(QueryError, match=r"stopped after 1\.5 s.*filter"):
-        query(empty, sql, timeout_s=1.5)
+        query(Question([empty], sql, timeout_s=1.5))
 
 
 @pytest.mark.slow
 def test_memory_is_bounded(empty: Run) -> None:
     with pytest.raises(QueryError, match=r"(?s)Out of Memory.*filter by iteration") as caught:
-        query(empty, "SELECT list(range) FROM range(300000000)")
+        query(Question([empty], "SELECT list(range) FROM range(300000000)"))
     assert "SET" not in str(caught.value)
 
 
@@ -184,7 +189,7 @@ def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
 @pytest.mark.slow
 def test_the_result_is_bounded(empty: Run) -> None:
     with pytest.raises(QueryError, match=r"larger than 1 GB.*LIMIT"):
-        query(empty, "SELECT range, range AS b, range AS c FROM range(50000000)")
+        query(Question([empty], "SELECT range, range AS b, range AS c FROM range(50000000)"))
 
 
 def test_the_process_that_answers_loads_nothing_heavy() -> None:
