@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch] */*/*/nati
 train: install
 	$(BIN)/t6gps train flat-quick
 
-# All tests, thirteen minutes on two cores; then those that need neither Ray nor a trained run, two minutes.
+# All tests, twenty minutes on two cores; then those that need neither Ray nor a trained run, three minutes.
 test: install
 	$(BIN)/pytest $(SPREAD)
 
