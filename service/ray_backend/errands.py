@@ -154,11 +154,8 @@ def remove(root: str, *runs: str) -> None:
 
 
 def status(root: str, run: str) -> Status | None:
-    """How a run is, None where it has no workers yet."""
-    if not catalog.exists(Path(root), run):
-        return None
-    found = catalog.open_run(Path(root), run)
-    return statuses.status(found) if (found.pool / "status.json").exists() else None
+    """As `statuses.begun`."""
+    return statuses.begun(Path(root), run)
 
 
 def scale(root: str, run: str, workers: str, deadline_s: str) -> Status:

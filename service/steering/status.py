@@ -8,6 +8,7 @@ from __future__ import annotations
 import json
 import os
 import time
+from pathlib import Path
 from typing import Required
 
 from pydantic import TypeAdapter, ValidationError
@@ -145,6 +146,14 @@ def last_said(run: Run) -> Status | None:
     except OSError as error:
         reason = str(error.strerror)
     raise RunError(f"cannot read {path}: {reason}; resume the run, which writes it anew")
+
+
+def begun(root: Path, name: str) -> Status | None:
+    """How a run below a root is, None where it is not there yet, or has had no workers yet."""
+    if not catalog.exists(root, name):
+        return None
+    run = catalog.open_run(root, name)
+    return None if last_said(run) is None else status(run)
 
 
 def status(run: Run) -> Status:

@@ -30,10 +30,11 @@ def chosen_of(name: str, kept: list[int], version: int | None) -> int:
 
 def load(run: Run, version: int | None) -> PolicySnapshot:
     """The policy of a version, the newest by default. RunError naming the versions that are kept."""
-    chosen = chosen_of(run.name, versions(run), version)
-    if chosen in _in_table(run):
+    in_table, checkpoints = _in_table(run), checkpoint.kept(run.checkpoints)
+    chosen = chosen_of(run.name, sorted(in_table | set(checkpoints)), version)
+    if chosen in in_table:
         return tables.policy(run, chosen)
-    _, manifest, arrays = checkpoint.load(checkpoint.kept(run.checkpoints)[chosen])
+    _, manifest, arrays = checkpoint.load(checkpoints[chosen])
     try:
         return packed_policy(cast(Manifest, manifest), arrays)
     except KeyError as error:

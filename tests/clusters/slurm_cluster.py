@@ -119,10 +119,17 @@ def started(folder: Path) -> Iterator[Cluster]:
 
 def wait_until(condition: Callable[[], bool], seconds: float) -> None:
     """Return as soon as a condition holds; an error when it does not by then."""
+    assert _becomes(condition, seconds), f"still not so after {seconds} s"
+
+
+def _becomes(condition: Callable[[], bool], seconds: float) -> bool:
+    """Wait until a condition holds, and say whether it does by then."""
     deadline = time.monotonic() + seconds
     while not condition():
-        assert time.monotonic() < deadline, f"still not so after {seconds} s"
-        time.sleep(0.1)
+        if time.monotonic() > deadline:
+            return False
+        time.sleep(0.1)  # other processes bring the condition about: there is nothing to wait on but the clock
+    return True
 
 
 def _network(cluster: Cluster, stack: ExitStack) -> None:
@@ -138,16 +145,12 @@ def _end(cluster: Cluster) -> None:
     """End the jobs, then the daemons, then whatever is left."""
     cluster.call("scancel", "--full", "--signal=KILL", "--state=RUNNING")
     cluster.call("scancel", "--state=PENDING")
-    deadline = time.monotonic() + ENDED_S
-    while cluster.of_jobs() and time.monotonic() < deadline:
-        time.sleep(0.1)
+    _becomes(lambda: not cluster.of_jobs(), ENDED_S)
     cluster.call("scontrol", "shutdown")
     munge = cluster.folder / "munge" / "pid"
     if munge.exists():
         os.kill(_number(munge), signal.SIGTERM)
-    deadline = time.monotonic() + ENDED_S
-    while cluster.processes() and time.monotonic() < deadline:
-        time.sleep(0.1)
+    _becomes(lambda: not cluster.processes(), ENDED_S)
     for pid in cluster.processes():
         os.kill(pid, signal.SIGKILL)
 

@@ -10,7 +10,7 @@ from typing import Any
 import pytest
 import yaml
 from jsonschema import ValidationError
-from ray.autoscaler._private.util import prepare_config, validate_config
+from ray.autoscaler._private.util import prepare_config, validate_config  # what `ray up` calls; it has no public name
 
 FILE = resources.files("t6gps.deploy") / "ray" / "cluster.yaml"
 

@@ -11,7 +11,7 @@ from pathlib import Path
 import pytest
 import ray
 from house import QUICK_HEALTH_CHECKS, House, add_node, joining, others, started
-from ray.autoscaler._private.constants import AUTOSCALER_RESOURCE_REQUEST_CHANNEL
+from ray.autoscaler._private.constants import AUTOSCALER_RESOURCE_REQUEST_CHANNEL  # Ray tells no other way
 from ray.cluster_utils import Cluster
 from ray.experimental.internal_kv import _internal_kv_get
 

@@ -30,11 +30,8 @@ def files(root: str, run: str) -> dict[str, tuple[int, str]]:
 
 
 def status(root: str, run: str) -> Status | None:
-    """How a run is, None where it is not there yet, or has no workers yet."""
-    if not catalog.exists(Path(root), run):
-        return None
-    opened = catalog.open_run(Path(root), run)
-    return statuses.status(opened) if (opened.pool / "status.json").exists() else None
+    """As `statuses.begun`."""
+    return statuses.begun(Path(root), run)
 
 
 def scale(root: str, run: str, workers: str, deadline_s: str) -> Status:
