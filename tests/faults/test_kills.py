@@ -18,10 +18,10 @@ from typing import Any
 
 import pytest
 import synthetic
+import toil
 
 from t6gps.storage import catalog, tables
 from t6gps.storage.care.verify import verify
-from t6gps.storage.catalog import Run
 from t6gps.storage.spool import Spool
 
 KILLS_N = int(os.environ.get("T6GPS_KILLS", "20"))
@@ -34,7 +34,7 @@ DEADLINE_S = 120.0
 def forks() -> ForkServerContext:
     """Starts processes in milliseconds: what they import is loaded once, and Delta's threads are not started there."""
     context = multiprocessing.get_context("forkserver")
-    context.set_forkserver_preload(["synthetic", "t6gps.storage.care.verify", "t6gps.storage.spool"])
+    context.set_forkserver_preload(["toil"])
     return context
 
 
@@ -65,24 +65,11 @@ def killed(forks: ForkServerContext) -> Callable[..., list[Any]]:
     return kill
 
 
-def train(say: Connection, folder: Path) -> None:
-    """Spool, commit and clear iterations without end; say each episode that is acknowledged."""
-    run = Run(folder)
-    with catalog.locked(run):
-        for number in range(tables.committed_iterations(run), 10**6):
-            spool = Spool(run.spool, number)
-            for episode in synthetic.episodes(number):
-                spool.append(episode)
-                say.send(episode.episode_id)
-            synthetic.commit(run, number)
-            spool.clear()
-
-
 def test_a_run_that_is_killed_keeps_every_acknowledged_episode_and_is_sound(tmp_path: Path, killed: Any) -> None:
     run = catalog.create(tmp_path, "run", "{}")
     acknowledged = set[int]()
     for _ in range(KILLS_N):
-        acknowledged |= set(killed(train, 3 * synthetic.EPISODES_N, run.path))
+        acknowledged |= set(killed(toil.train, 3 * synthetic.EPISODES_N, run.path))
         assert verify(run) == []
         committed_n = tables.committed_iterations(run)
         kept = set(tables.read(run, "episodes", ["episode_id"])["episode_id"].to_pylist())
@@ -90,47 +77,17 @@ def test_a_run_that_is_killed_keeps_every_acknowledged_episode_and_is_sound(tmp_
     assert tables.committed_iterations(run) > KILLS_N / 4
 
 
-def shuffle(say: Connection, folder: Path) -> None:
-    """Copy a run, move the copy and remove it, without end."""
-    run = Run(folder)
-    for number in range(10**6):
-        say.send(number)
-        copy = catalog.copy(run, folder.parent, f"copy-{os.getpid()}-{number}")
-        moved = catalog.move(copy, folder.parent, f"moved-{os.getpid()}-{number}")
-        catalog.remove(moved)
-
-
 def test_runs_whose_copying_moving_or_removal_is_killed_are_whole_or_gone(tmp_path: Path, killed: Any) -> None:
     run = catalog.create(tmp_path, "run", "{}")
     synthetic.commit(run, 0)
     rows = tables.read(run, "frames")
     for _ in range(KILLS_N):
-        killed(shuffle, 3, run.path)
+        killed(toil.shuffle, 3, run.path)
         for other in catalog.list_runs(tmp_path):
             assert verify(other) == []
             assert tables.read(other, "frames") == rows
             if other != run:
                 catalog.remove(other)
-
-
-def write(say: Connection, root: Path, name: str) -> None:
-    """Make a run of five iterations."""
-    run = catalog.create(root, name, "{}")
-    for number in range(5):
-        synthetic.commit(run, number)
-    say.send("done")
-
-
-def read(say: Connection, root: Path) -> None:
-    """Read all runs of a root until it has the file `stop`; say how many looks there were."""
-    looks_n = 0
-    while not (root / "stop").exists():
-        for run in catalog.list_runs(root):
-            assert verify(run) == []
-            committed_n = tables.committed_iterations(run)
-            assert tables.read(run, "frames", ["episode_id"]).num_rows >= committed_n * synthetic.FRAMES_N
-            looks_n += 1
-    say.send(looks_n)
 
 
 @pytest.fixture
@@ -153,8 +110,8 @@ def started(forks: ForkServerContext) -> Iterator[Callable[..., tuple[BaseProces
 
 
 def test_four_who_write_runs_and_four_who_read_them_do_not_disturb_each_other(tmp_path: Path, started: Any) -> None:
-    readers = [started(read, tmp_path) for _ in range(4)]
-    writers = [started(write, tmp_path, f"run-{number}") for number in range(4)]
+    readers = [started(toil.read, tmp_path) for _ in range(4)]
+    writers = [started(toil.write, tmp_path, f"run-{number}") for number in range(4)]
     for process, said in writers:
         assert said.poll(DEADLINE_S) and said.recv() == "done"
         process.join(DEADLINE_S)
