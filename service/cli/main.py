@@ -1,7 +1,7 @@
 """The command line `t6gps`. Results go to stdout, progress and messages to stderr; bad input exits with 2.
 
-This module has the commands that start something: train, study, eval, bench. `stored` has those that read what is
-there, `live` those for a run that is running, `launching` those for jobs. What is slow to import (ray, torch,
+This module has the commands that start something: train, study, eval, bench. `data` has those for what is stored,
+`live` those for a run that is running, `launching` those for jobs. What is slow to import (ray, torch,
 matplotlib) is imported by the commands that need it, so that the others answer at once.
 """
 
@@ -19,7 +19,8 @@ import typer
 from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import care, doctor, door, launching, live, serving, stored
+from t6gps.service.cli import doctor, door, launching, live, serving
+from t6gps.service.cli.data import asking, care, export, listing, pictures
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -105,10 +106,10 @@ def train(
     from t6gps.service.views import run_figures
 
     pictures = run_figures.draw(run, origin.configured(run))
-    stored.print_learning(run)
+    listing.print_learning(run)
     terminal.print_evaluation(result)
     live.name_quarantined(run)
-    stored.print_paths(run, pictures, root)
+    listing.print_paths(run, pictures, root)
 
 
 @app.command()
@@ -201,8 +202,8 @@ def bench(
     typer.echo("".join(f"{note}\n" for note in measurement.notes), nl=False)
 
 
-stored.add_to(app)
-care.add_to(app)
+for commands in (listing, asking, pictures, export, care):
+    commands.add_to(app)
 live.add_to(app)
 launching.add_to(app)
 serving.add_to(app)
