@@ -23,10 +23,15 @@ def test_the_presets_of_the_paper_have_its_sizes() -> None:
         "flat-quick",
         "flat-soft",
         "flat-stiff",
+        "paper",
+        "paper-quick",
         "rough",
         "rough-quick",
     ]
-    rough, flat = load("rough"), load("flat")
+    rough, flat, paper = load("rough"), load("flat"), load("paper")
+    assert (paper.run.episodes, paper.run.steps, paper.run.iterations) == (300, 250, 5)
+    assert (paper.task.target_speed_m_per_s, paper.learner.hidden_layers) == (0.8, (256, 256, 256))
+    assert (paper.learner.prior_samples, paper.learner.value_from, paper.learner.replay_iterations) == (0, 0, 0)
     assert (rough.run.episodes, rough.run.steps, rough.run.iterations) == (100, 250, 15)
     assert rough.terrain.difficulty == 1.0
     assert flat.run.episodes * flat.run.steps * flat.run.iterations == 125_000
