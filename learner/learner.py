@@ -9,8 +9,8 @@ for done, total in learner.supervise(): ...         learner.snapshot is now the 
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Iterator, Mapping
-from dataclasses import dataclass
+from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
+from dataclasses import dataclass, replace
 from typing import TypeVar
 
 import numpy as np
@@ -102,8 +102,8 @@ class Learner:
         self._episodes = Episodes(readings, settings.longest_segment_steps)
         self._done = _Done()
 
-    def _rng(self, iteration: int, stream: Stream) -> np.random.Generator:
-        return generator(self._run_seed, branch(iteration, stream))
+    def _rng(self, iteration: int, stream: Stream, round_: int = 0) -> np.random.Generator:
+        return generator(self._run_seed, branch(iteration, stream, *([round_] if round_ else [])))
 
     @property
     def snapshot(self) -> PolicySnapshot:
@@ -131,6 +131,8 @@ class Learner:
         rows = self._rows.rows(columns)
         if self._value:
             self._value.add(transitions.of_columns(columns, self._reach_m))
+            if self._led_by_value and self._settings.models_share:
+                rows = transitions.with_reach(rows, columns["rest_lengths"], self._reach_m)
         yield 1, 2
         segments = classify(rows, places)
         segmented = self._settings.localization in SEGMENTED
@@ -154,27 +156,41 @@ class Learner:
 
     def backward_pass(self) -> Progress:
         """Improve the actions along all sub-trajectories (lines 8 to 11)."""
+        self._done.improved = yield from self._improve(self.snapshot, 0)
+
+    @property
+    def _led_by_value(self) -> bool:
+        return self._value is not None and self.snapshot.version >= self._settings.value_from
+
+    def _improve(self, snapshot: PolicySnapshot, round_: int) -> Generator[tuple[int, int], None, Improved]:
+        """Improve the actions beside those of a policy, in the first or a further round of the iteration."""
         rows, series = _of(self._done.segmented, "segment").rows, _of(self._done.fitted, "fit").series
-        settings, iteration = self._settings, self.snapshot.version
-        surrogate = Surrogate(rows, series, *self._cost_weights)
+        settings, surrogate = self._settings, Surrogate(rows, series, *self._cost_weights)
         leading: Improver
-        if self._value and iteration >= settings.value_from:
-            rng = self._rng(iteration, Stream.ACTION_VALUE)
-            leading = ByActionValue(surrogate, self._value, self.snapshot, rng, self._command_range_m)
+        if self._value and self._led_by_value:
+            rng = self._rng(self.snapshot.version, Stream.ACTION_VALUE, round_)
+            leading = ByActionValue(surrogate, self._value, snapshot, rng, self._command_range_m, settings)
         else:
             leading = ByBackwardPass(surrogate, settings)
-        improved = improver.improve(rows, leading, settings.horizon_steps, self._command_range_m)
-        self._done.improved = yield from improved
+        improved = yield from improver.improve(rows, leading, settings.horizon_steps, self._command_range_m)
+        return improved
 
     def supervise(self) -> Progress:
         """Train the policy on this iteration's pairs and the replayed ones (line 13); then let go of the rows."""
         segmented, fitted = _of(self._done.segmented, "segment"), _of(self._done.fitted, "fit")
         rows, improved, iteration = segmented.rows, _of(self._done.improved, "backward_pass"), self.snapshot.version
-        learned = improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
         seen = rows.observation[:, : SEEN_N[self._settings.observation]]
-        pairs = Pairs(seen, learned, np.flatnonzero(rows.continues))
-        rng, all_pairs = self._rng(iteration, Stream.SUPERVISED), Several([*self._carried.replayed, pairs])
-        newest, loss = yield from supervised.train(self.snapshot, all_pairs, self._settings, rng)
+        rounds, newest = self._settings.rounds if self._led_by_value else 1, self.snapshot
+        before = None
+        for round_ in range(rounds):
+            if round_:
+                improved = yield from self._improve(newest, round_)
+            pairs = Pairs(seen, _learned(improved, rows), np.flatnonzero(rows.continues))
+            rng, all_pairs = self._rng(iteration, Stream.SUPERVISED, round_), Several([*self._carried.replayed, pairs])
+            trained, loss = yield from supervised.train(newest, all_pairs, self._settings, rng)
+            before = loss.before if before is None else before
+            newest = replace(trained, version=iteration + 1)
+        loss = supervised.Loss(before, loss.after)
         self._carried.advance(newest, pairs)
         divergence = _divergence(newest, rows, seen, self._command_range_m)
         results = Iteration(segmented, fitted, improved, Trained(loss, divergence))
@@ -232,6 +248,11 @@ def _plans(
     if settings.localization in SEGMENTED:
         return local_models.plans(segmented.rows, segmented.segments, segmented.groups, options, run_seed, iteration)
     return localization.plans(segmented.rows, settings.localization, options, run_seed, iteration)
+
+
+def _learned(improved: Improved, rows: Rows) -> Floats:
+    """Improved actions in canonical frames [n, nu]."""
+    return improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
 
 
 def _divergence(snapshot: PolicySnapshot, rows: Rows, seen: Floats, command_range_m: tuple[float, float]) -> Floats:

@@ -49,6 +49,8 @@ class Rows:
     continues     the transition to the next row is a sample of the dynamics [n]: not after the last row of an
                   episode, nor over a jump between triangles without a common edge
     labels        canonical label of each entry of an action [n, nu] where actions are not canonical, else None
+    reach_m       farthest that a winch comes in a control step where models regress on what it reaches of a command,
+                  else None; the state ends in the rest lengths then
     """
 
     state: Floats
@@ -64,10 +66,19 @@ class Rows:
     acts: Flags
     continues: Flags
     labels: Ints | None = None
+    reach_m: float | None = None
 
     def samples(self, chosen: Ints) -> Floats:
         """Joint vectors [x; u; x'] of rows [m] that continue, and of the rows below them [m, 2 nx + nu]."""
-        return np.hstack([self.state[chosen], self.action[chosen], self.state[chosen + 1]])
+        return np.hstack([self.state[chosen], self.regressor(chosen, self.action[chosen]), self.state[chosen + 1]])
+
+    def regressor(self, chosen: Ints, action: Floats) -> Floats:
+        """What models regress on for actions [..., nu] (m) at rows [...]: those, or what winches reach in -1 .. 1."""
+        if self.reach_m is None:
+            return action
+        rest_lengths = self.state[chosen, -action.shape[-1] :]
+        reached: Floats = np.clip((action - rest_lengths) / np.float32(self.reach_m), -1, 1)
+        return reached
 
 
 def pieces(chosen: Ints, size: int = PIECE_ROWS) -> list[Ints]:

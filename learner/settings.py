@@ -42,6 +42,7 @@ class ActionValueSettings(Settings):
     remembered_iterations: int = Field(3, ge=1, le=20, description="iterations whose transitions are learned from")
     discount: float = Field(0.95, ge=0.0, lt=1.0, description="gamma, per control step of 0.1 s")
     hidden_layers: HiddenLayers = Field((128, 128), description="tanh units per hidden layer of Q")
+    critics: int = Field(1, ge=1, le=8, description="networks whose mean is Q")
     batch: int = Field(256, ge=1, le=100_000, description="transitions per gradient step")
     steps: int = Field(600, ge=1, le=1_000_000, description="gradient steps per iteration")
     first_steps: int = Field(1800, ge=1, le=1_000_000, description="gradient steps of the first iteration")
@@ -87,6 +88,23 @@ class LearnerSettings(Settings):
         0, ge=0, le=10_000, description="iteration from which a learned action value improves the actions; 0: never"
     )
     action_value: ActionValueSettings = ActionValueSettings()
+    rounds: int = Field(
+        1, ge=1, le=20, description="rounds of the action value, improved actions and S-step in an iteration it leads"
+    )
+    models_share: float = Field(
+        0.0, ge=0.0, le=1.0, description="share of the slope from the backward pass, the action value at its end"
+    )
+    models_horizon_steps: int = Field(
+        3, ge=1, le=100, description="steps of that pass: the mean over all lengths up to it"
+    )
+
+    @model_validator(mode="after")
+    def _led_by_a_value(self) -> "LearnerSettings":
+        if (self.models_share or self.rounds > 1) and not self.value_from:
+            raise ValueError("models_share and rounds need an action value; set value_from to 1 or later")
+        if self.models_share and self.reduced_state != "nodes":
+            raise ValueError("models_share needs reduced_state = nodes, to which it adds the rest lengths")
+        return self
 
     @model_validator(mode="after")
     def _value_in_canonical_frames(self) -> "LearnerSettings":

@@ -23,8 +23,10 @@ evaluations."""
 SENSORS_N, SHAPE_N = 47, 36
 OBSERVATION_N = SENSORS_N + SHAPE_N
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
-TARGET = slice(43, 45)
-"""Of these the target direction."""
+REST_LENGTHS, TARGET, NODES = slice(1, 25), slice(43, 45), slice(SENSORS_N, OBSERVATION_N)
+"""Of these the rest lengths about the nominal one, the target direction, and the nodes."""
+REST_LENGTH_SCALE_M, NODE_SCALE_M = 0.2, 0.5
+"""Their units."""
 
 
 def _schema(*fields: pa.Field) -> pa.Schema:

@@ -20,22 +20,27 @@ from __future__ import annotations
 
 import os
 from collections import deque
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 
 import numpy as np
 import torch
 
 from t6gps.learner import cost, policy
-from t6gps.learner.algorithm import supervised
-from t6gps.learner.improvers.transitions import INPUTS_N, MOVED, Transitions, joined
+from t6gps.learner.improvers.critic import Critic
+from t6gps.learner.improvers.transitions import MOVED, OBSERVATION_N, Transitions, joined
 from t6gps.learner.port import Arrays
-from t6gps.learner.rows import AnyArray, Floats, Ints, pieces
+from t6gps.learner.rows import VELOCITY_N, AnyArray, Floats, Ints, pieces
 from t6gps.learner.settings import ActionValueSettings
+from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
 
 PREPARED_N = 30
 """Gradient steps whose transitions are prepared at once."""
+VELOCITY = slice(OBSERVATION_N, OBSERVATION_N + VELOCITY_N)
+"""Where the velocity of the centre of mass is among [s; e]."""
+STATE_N = VELOCITY_N + schema.SHAPE_N + (MOVED.stop - MOVED.start)
+"""Entries of [velocity; nodes; rest lengths]."""
 
 
 class ActionValue:
@@ -53,16 +58,13 @@ class ActionValue:
     ) -> None:
         self._settings = settings
         self._target_speed_m_per_s, self._vertical_weight = target_speed_m_per_s, vertical_weight
-        first = policy.initial(INPUTS_N, 1, settings.hidden_layers, rng, offset_m=0.0, scale_m=1.0)
-        self._vector, self._layers = policy.parameters(first)
-        self._target, self._target_layers = policy.parameters(first)
-        self._moments = supervised.no_moments(self._vector)
+        self._critics = [Critic(settings, rng) for _ in range(settings.critics)]
         self._remembered: deque[Transitions] = deque(maxlen=settings.remembered_iterations)
 
     @property
     def steps_n(self) -> int:
         """Gradient steps that `learn` will take."""
-        return self._settings.steps if self._moments.step else self._settings.first_steps
+        return self._settings.steps if self._critics[0].has_learned else self._settings.first_steps
 
     def add(self, transitions: Transitions) -> None:
         """Take the transitions of one iteration; those of the oldest go."""
@@ -95,14 +97,16 @@ class ActionValue:
 
     def _step(self, before: torch.Tensor, after: torch.Tensor, reward: torch.Tensor) -> None:
         """One gradient step on transitions: [s; e] before and after [m, ni], and the reward [m, 1]."""
-        settings = self._settings
-        wanted = policy.activations(self._target_layers, after)[-1].mul_(settings.discount).add_(reward)
-        change = supervised.gradient(self._layers, before, wanted, len(before))
-        supervised.descend(self._vector, change, self._moments, settings.learning_rate, settings.weight_decay)
-        self._target.lerp_(self._vector, settings.target_rate)
+        following = _mean([critic.target_values(after) for critic in self._critics])
+        wanted = following.mul_(self._settings.discount).add_(reward)
+        for critic in self._critics:
+            critic.step(before, wanted)
 
-    def improved(self, snapshot: PolicySnapshot) -> Floats:
-        """u* [n, nu] (m) at the rows of the newest transitions."""
+    def improved(self, snapshot: PolicySnapshot, farther: Floats | None = None, share: float = 0.0) -> Floats:
+        """u* [n, nu] (m) at the rows of the newest transitions.
+
+        farther   another estimate of dQ/de [n, nu] (m/s), which makes up `share` of the slope that is climbed
+        """
         torch.set_num_threads(1)
         newest, act, settings = self._remembered[-1], _actor(snapshot), self._settings
 
@@ -110,19 +114,35 @@ class ActionValue:
             inputs, rest_lengths = newest.take(rows)
             start = act(inputs)
             command = start.clone()
+            others = None if farther is None else torch.from_numpy(farther[rows]).mul_(share)
             for _ in range(settings.ascents):
                 inputs[:, MOVED] = _moved(command, rest_lengths, newest.reach_m)
-                wanted = start + settings.step_weight * self.slope(inputs, newest.reach_m)
+                slope = self._gradient(inputs)[:, MOVED]
+                if others is not None:
+                    slope = slope.mul_(1 - share).add_(others)
+                wanted = start + settings.step_weight * _of_commands(slope, inputs, newest.reach_m)
                 command += settings.ascent_rate * (wanted - command)
             return command
 
-        n = len(newest.acts)
-        parts = np.split(np.arange(n), range(policy.ROWS, n, policy.ROWS))
-        climbed = np.empty((n, MOVED.stop - MOVED.start), dtype=np.float32)
-        with ThreadPoolExecutor(os.cpu_count()) as threads:
-            for rows, command in zip(parts, threads.map(climb, parts), strict=True):
-                climbed[rows] = command.numpy()
-        return climbed
+        return _every_row(climb, len(newest.acts), MOVED.stop - MOVED.start)
+
+    def state_slopes(self, snapshot: PolicySnapshot) -> Floats:
+        """dV/dx [n, nx] at the rows of the newest transitions, x = [velocity; nodes; rest lengths] (m/s per m/s, m).
+
+        V(x) = Q(s, e(u)) with the command u of a policy, held: rest lengths enter Q as a part of s, and through e.
+        """
+        torch.set_num_threads(1)
+        newest, act = self._remembered[-1], _actor(snapshot)
+
+        def slopes(rows: Ints) -> torch.Tensor:
+            inputs, rest_lengths = newest.take(rows)
+            inputs[:, MOVED] = _moved(act(inputs), rest_lengths, newest.reach_m)
+            of = self._gradient(inputs)
+            by_rest = of[:, schema.REST_LENGTHS] / schema.REST_LENGTH_SCALE_M
+            by_rest -= _of_commands(of[:, MOVED], inputs, newest.reach_m)
+            return torch.hstack([of[:, VELOCITY], of[:, schema.NODES] / schema.NODE_SCALE_M, by_rest])
+
+        return _every_row(slopes, len(newest.acts), STATE_N)
 
     def _mean_reward(self, known: Transitions, index: Ints) -> np.float32:
         """Mean reward over the rows after those that act [m]."""
@@ -139,29 +159,52 @@ class ActionValue:
         return (spent / (-2 * speed)).astype(np.float32)
 
     def values(self, inputs: torch.Tensor) -> torch.Tensor:
-        """Q [m] of inputs [s; e] [m, ni] (m/s)."""
-        return policy.activations(self._layers, inputs)[-1][:, 0]
+        """Q [m] of inputs [s; e] [m, ni] (m/s): the mean of all critics."""
+        return _mean([critic.values(inputs) for critic in self._critics])[:, 0]
 
     def slope(self, inputs: torch.Tensor, reach_m: float) -> torch.Tensor:
         """dQ/du [m, nu] (1/s) at inputs [s; e] [m, ni]: zero where the winch cannot reach."""
-        values = policy.activations(self._layers, inputs)
-        back = self._layers[-1][0].expand(len(inputs), -1)
-        for number in reversed(range(len(self._layers) - 1)):
-            back = torch.ops.aten.tanh_backward(back, values[number + 1]) @ self._layers[number][0]
-        return back[:, MOVED].mul(inputs[:, MOVED].abs() < 1).div_(reach_m)
+        return _of_commands(self._gradient(inputs)[:, MOVED], inputs, reach_m)
+
+    def _gradient(self, inputs: torch.Tensor) -> torch.Tensor:
+        return _mean([critic.gradient(inputs) for critic in self._critics])
 
     def arrays(self) -> Arrays:
         """What the next iteration depends on, but for the transitions, which the run's tables hold."""
-        tensors = {"learned": self._vector, "target": self._target} | self._moments._asdict()
-        return {f"value_{name}": tensor.numpy().copy() for name, tensor in tensors.items()}
+        critics = zip(_names(len(self._critics)), self._critics, strict=True)
+        return {prefix + name: array for prefix, critic in critics for name, array in critic.arrays().items()}
 
     def restore(self, arrays: Mapping[str, AnyArray]) -> None:
         """Continue from `arrays()`; the transitions are yet to be added. KeyError when an entry is missing."""
         self._remembered.clear()
-        self._vector.copy_(torch.from_numpy(arrays["value_learned"]))
-        self._target.copy_(torch.from_numpy(arrays["value_target"]))
-        names = supervised.Moments._fields
-        self._moments = supervised.Moments(*(torch.from_numpy(arrays[f"value_{name}"]) for name in names))
+        for prefix, critic in zip(_names(len(self._critics)), self._critics, strict=True):
+            named = {name.removeprefix(prefix): array for name, array in arrays.items() if name.startswith(prefix)}
+            critic.restore(named)
+
+
+def _names(critics_n: int) -> list[str]:
+    """What the names of the arrays of each critic begin with."""
+    return ["value_", *(f"value{number}_" for number in range(2, critics_n + 1))]
+
+
+def _mean(parts: Sequence[torch.Tensor]) -> torch.Tensor:
+    """The mean of equal shapes; a single one as it is."""
+    return parts[0] if len(parts) == 1 else torch.stack(list(parts)).mean(dim=0)
+
+
+def _every_row(function: Callable[[Ints], torch.Tensor], n: int, width: int) -> Floats:
+    """What a function finds at rows [m, width], for all n rows, on all cores."""
+    parts = np.split(np.arange(n), range(policy.ROWS, n, policy.ROWS))
+    found = np.empty((n, width), dtype=np.float32)
+    with ThreadPoolExecutor(os.cpu_count()) as threads:
+        for rows, values in zip(parts, threads.map(function, parts), strict=True):
+            found[rows] = values.numpy()
+    return found
+
+
+def _of_commands(slope: torch.Tensor, inputs: torch.Tensor, reach_m: float) -> torch.Tensor:
+    """d/du [m, nu] of what has the slopes d/de [m, nu] at inputs [s; e]: zero where the winch cannot reach."""
+    return slope * (inputs[:, MOVED].abs() < 1) / reach_m
 
 
 def _portions(steps_n: int) -> list[int]:

@@ -48,8 +48,11 @@ class Surrogate:
 
     def residual(self, steps: Ints) -> Floats:
         """r of the cost in the states after steps [b, T] at rows that continue [b, T, 3] (m/s)."""
-        after = steps + 1
-        state, target = self.rows.state[after, :VELOCITY_N], self.rows.target[after]
+        return self.residual_at(steps + 1)
+
+    def residual_at(self, chosen: Ints) -> Floats:
+        """r of the cost in the states of rows [...] as [..., 3] (m/s)."""
+        state, target = self.rows.state[chosen, :VELOCITY_N], self.rows.target[chosen]
         residual: Floats = cost.residual(state, target, self.target_speed_m_per_s, self.vertical_weight)
         return residual
 

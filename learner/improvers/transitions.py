@@ -20,7 +20,7 @@ import torch
 from t6gps.learner import policy
 from t6gps.learner.algorithm.features import acting, spread, vectors
 from t6gps.learner.episodes import Episodes
-from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, pieces
+from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, Rows, pieces
 from t6gps.storage import fields, schema
 from t6gps.storage.errors import RunError
 
@@ -204,6 +204,11 @@ def recalled(episodes: Mapping[int, pa.Table], motion: Motion, reach_m: float) -
     for episode_id, frames in episodes.items():
         taken.add(episode_id, frames)
     return of_columns(taken.joined()[0], reach_m)
+
+
+def with_reach(rows: Rows, rest_lengths: Floats, reach_m: float) -> Rows:
+    """Rows whose state has the rest lengths [n, nu] (m) as well, and whose models regress on what winches reach."""
+    return replace(rows, state=np.hstack([rows.state, rest_lengths]), reach_m=reach_m)
 
 
 def of_columns(columns: Columns, reach_m: float) -> Transitions:

@@ -18,22 +18,16 @@ from math import cos, hypot, sin
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
+from t6gps.storage.schema import NODE_SCALE_M, OBSERVATION_N, REST_LENGTH_SCALE_M, SENSORS_N
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame
 from t6gps.workers.robot.symmetry import BARS_FROM, CABLES_FROM, NODES_FROM, PROPER, world_map
-
-REST_LENGTH_SCALE_M = 0.2
-"""The unit of rest lengths."""
 
 ANGULAR_VELOCITY_SCALE_RAD_PER_S = 2.0
 """The unit of angular velocities."""
 
 SLOWEST_TRACK_M_PER_S = 0.05
 """Below this speed of the centre of mass its direction means little, and fades."""
-
-NODE_SCALE_M = 0.5
-"""The unit of nodes."""
 
 FARTHEST_NODE = 4.0
 """In that unit: 2 m from the centre of mass, where nodes never are."""
