@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import TypeVar
 
 import numpy as np
@@ -30,13 +31,12 @@ from t6gps.learner.episodes import Episodes, Reading, RowReading
 from t6gps.learner.exploration import exploration
 from t6gps.learner.improvers import improver, transitions
 from t6gps.learner.improvers.action_value import ActionValue
-from t6gps.learner.improvers.by_action_value import ByActionValue
-from t6gps.learner.improvers.by_backward_pass import ByBackwardPass
-from t6gps.learner.improvers.improver import Improved, Improver, Surrogate
+from t6gps.learner.improvers.improver import Improved, Surrogate
+from t6gps.learner.improvers.leading import leading
 from t6gps.learner.phases import PHASES
-from t6gps.learner.port import LearnerState, Manifest, Progress, Report
+from t6gps.learner.port import LearnerState, Manifest, Progress, Report, Task
 from t6gps.learner.report import Fitted, Iteration, Segmented, Trained, kl, report
-from t6gps.learner.rows import AnyArray, Flags, Floats, Ints, Rows, pieces
+from t6gps.learner.rows import AnyArray, Floats, Rows, pieces
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.learner.streams import Stream, branch, generator
 from t6gps.storage import schema, tables
@@ -57,53 +57,44 @@ SEEN_N = {"sensors": schema.SENSORS_N, "shape": schema.OBSERVATION_N}
 class Learner:
     """Turns the episodes of one iteration into the next policy.
 
-    run_seed               root of all randomness here, with the iteration, which is the policy's version
-    target_speed_m_per_s   v* of the cost
-    vertical_weight        weight of the vertical velocity in the cost
-    command_range_m        improved actions are clipped to it
-    offset_m, scale_m      u = offset + scale * network
-    reach_m                farthest that a winch comes in a control step
-    world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
-    mirrored               the symmetry element mirrors the world [elements]
-    fit_map                maps a pure function over jobs as results are asked for, in their order; `map` or a pool
-    keeps_earlier          the policy before the newest is kept, too, for workers that act with it in a pipelined run
+    run_seed        root of all randomness here, with the iteration, which is the policy's version
+    fit_map         maps a pure function over jobs as results are asked for, in their order; `map` or a pool
+    keeps_earlier   the policy before the newest is kept, too, for workers that act with it in a pipelined run
     """
 
     def __init__(
         self,
         settings: LearnerSettings,
-        *,
+        task: Task,
         run_seed: int,
-        target_speed_m_per_s: float,
-        vertical_weight: float,
-        command_range_m: tuple[float, float],
-        offset_m: float,
-        scale_m: float,
-        reach_m: float,
-        world_labels: Ints,
-        mirrored: Flags,
         fit_map: FitMap = map,
         keeps_earlier: bool = False,
     ) -> None:
-        self._settings, self._run_seed, self._fit_map = settings, run_seed, fit_map
-        self._cost_weights = target_speed_m_per_s, vertical_weight
-        self._command_range_m, self._reach_m = command_range_m, reach_m
-        sizes = SEEN_N[settings.observation], world_labels.shape[1], settings.hidden_layers
-        untrained = policy.initial(*sizes, self._rng(0, Stream.UNTRAINED), offset_m=offset_m, scale_m=scale_m)
+        self._settings, self._task, self._run_seed, self._fit_map = settings, task, run_seed, fit_map
+        sizes = SEEN_N[settings.observation], task.world_labels.shape[1], settings.hidden_layers
+        first = generator(run_seed, branch(0, Stream.UNTRAINED))
+        untrained = policy.initial(*sizes, first, offset_m=task.offset_m, scale_m=task.scale_m)
         self._carried = Carried(untrained, settings.replay_iterations, keeps_earlier)
         self._value: ActionValue | None = None
         if settings.value_from:
-            first = self._rng(0, Stream.ACTION_VALUE)
-            self._value = ActionValue(settings.action_value, *self._cost_weights, first)
+            first = generator(run_seed, branch(0, Stream.ACTION_VALUE))
+            self._value = ActionValue(settings.action_value, *self._task.cost_weights, first)
         in_world = settings.localization is Localization.TIME
-        self._rows: RowReading = standard_gps.InWorld(world_labels) if in_world else Canonical(settings.reduced_state)
-        self._motion = transitions.Motion(mirrored)
+        self._rows: RowReading = (
+            standard_gps.InWorld(task.world_labels) if in_world else Canonical(settings.reduced_state)
+        )
+        self._motion = transitions.Motion(task.mirrored)
         readings: list[Reading] = [self._rows, *([self._motion] if self._value else [])]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
         self._done = _Done()
 
-    def _rng(self, iteration: int, stream: Stream, round_: int = 0) -> np.random.Generator:
-        return generator(self._run_seed, branch(iteration, stream, *([round_] if round_ else [])))
+    def _rng(self, stream: Stream, round_: int = 0) -> np.random.Generator:
+        key = branch(self.snapshot.version, stream, *([round_] if round_ else []))
+        return generator(self._run_seed, key)
+
+    @property
+    def _led_by_value(self) -> bool:
+        return self._value is not None and self.snapshot.version >= self._settings.value_from
 
     @property
     def snapshot(self) -> PolicySnapshot:
@@ -130,9 +121,9 @@ class Learner:
         columns, places = self._episodes.joined()
         rows = self._rows.rows(columns)
         if self._value:
-            self._value.add(transitions.of_columns(columns, self._reach_m))
-            if self._led_by_value and self._settings.models_share:
-                rows = transitions.with_reach(rows, columns["rest_lengths"], self._reach_m)
+            self._value.add(transitions.of_columns(columns, self._task.reach_m))
+        if self._led_by_value and self._settings.models_share:
+            rows = transitions.with_reach(rows, columns["rest_lengths"], self._task.reach_m)
         yield 1, 2
         segments = classify(rows, places)
         segmented = self._settings.localization in SEGMENTED
@@ -158,43 +149,34 @@ class Learner:
         """Improve the actions along all sub-trajectories (lines 8 to 11)."""
         self._done.improved = yield from self._improve(self.snapshot, 0)
 
-    @property
-    def _led_by_value(self) -> bool:
-        return self._value is not None and self.snapshot.version >= self._settings.value_from
-
     def _improve(self, snapshot: PolicySnapshot, round_: int) -> Generator[tuple[int, int], None, Improved]:
-        """Improve the actions beside those of a policy, in the first or a further round of the iteration."""
         rows, series = _of(self._done.segmented, "segment").rows, _of(self._done.fitted, "fit").series
-        settings, surrogate = self._settings, Surrogate(rows, series, *self._cost_weights)
-        leading: Improver
-        if self._value and self._led_by_value:
-            rng = self._rng(self.snapshot.version, Stream.ACTION_VALUE, round_)
-            leading = ByActionValue(surrogate, self._value, snapshot, rng, self._command_range_m, settings)
-        else:
-            leading = ByBackwardPass(surrogate, settings)
-        improved = yield from improver.improve(rows, leading, settings.horizon_steps, self._command_range_m)
-        return improved
+        value, draws = self._value if self._led_by_value else None, partial(self._rng, Stream.ACTION_VALUE, round_)
+        surrogate = Surrogate(rows, series, *self._task.cost_weights)
+        leads = leading(value, surrogate, snapshot, draws, self._task.command_range_m, self._settings)
+        return improver.improve(rows, leads, self._settings.horizon_steps, self._task.command_range_m)
 
     def supervise(self) -> Progress:
-        """Train the policy on this iteration's pairs and the replayed ones (line 13); then let go of the rows."""
+        """Train the policy on this iteration's pairs and the replayed ones (line 13); then let go of the rows.
+
+        Where the action value leads, further rounds each learn it anew for the policy so far, improve and train.
+        """
         segmented, fitted = _of(self._done.segmented, "segment"), _of(self._done.fitted, "fit")
         rows, improved, iteration = segmented.rows, _of(self._done.improved, "backward_pass"), self.snapshot.version
-        seen = rows.observation[:, : SEEN_N[self._settings.observation]]
-        rounds, newest = self._settings.rounds if self._led_by_value else 1, self.snapshot
-        before = None
-        for round_ in range(rounds):
+        seen, newest, losses = rows.observation[:, : SEEN_N[self._settings.observation]], self.snapshot, []
+        for round_ in range(self._settings.rounds if self._led_by_value else 1):
             if round_:
                 improved = yield from self._improve(newest, round_)
             pairs = Pairs(seen, _learned(improved, rows), np.flatnonzero(rows.continues))
-            rng, all_pairs = self._rng(iteration, Stream.SUPERVISED, round_), Several([*self._carried.replayed, pairs])
-            trained, loss = yield from supervised.train(newest, all_pairs, self._settings, rng)
-            before = loss.before if before is None else before
-            newest = replace(trained, version=iteration + 1)
-        loss = supervised.Loss(before, loss.after)
+            rng, all_pairs = self._rng(Stream.SUPERVISED, round_), Several([*self._carried.replayed, pairs])
+            newest, loss = yield from supervised.train(newest, all_pairs, self._settings, rng)
+            losses.append(loss)
+        newest = replace(newest, version=iteration + 1)
         self._carried.advance(newest, pairs)
-        divergence = _divergence(newest, rows, seen, self._command_range_m)
-        results = Iteration(segmented, fitted, improved, Trained(loss, divergence))
-        self._done = _Done(report=report(results, iteration, self._command_range_m, *self._cost_weights))
+        divergence = _divergence(newest, rows, seen, self._task.command_range_m)
+        trained = Trained(supervised.Loss(losses[0].before, losses[-1].after), divergence)
+        results = Iteration(segmented, fitted, improved, trained)
+        self._done = _Done(report=report(results, iteration, self._task.command_range_m, *self._task.cost_weights))
         if self._value:
             self._value.file_away()
 
@@ -218,7 +200,7 @@ class Learner:
         newest, remembered_n = self.snapshot.version, self._settings.action_value.remembered_iterations
         for iteration in range(max(newest - remembered_n + 1, 0), newest):
             episodes = tables.frames_of(run, iteration, transitions.COLUMNS)
-            self._value.add(transitions.recalled(episodes, self._motion, self._reach_m))
+            self._value.add(transitions.recalled(episodes, self._motion, self._task.reach_m))
             self._value.file_away()
 
 

@@ -3,11 +3,12 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping
+from dataclasses import dataclass
 from typing import NamedTuple, Protocol, TypedDict
 
 import pyarrow as pa
 
-from t6gps.learner.rows import AnyArray
+from t6gps.learner.rows import AnyArray, Flags, Ints
 from t6gps.storage.catalog import Run
 from t6gps.storage.records import PolicySnapshot
 
@@ -52,6 +53,34 @@ class Report(NamedTuple):
     iteration: Row
     classes: list[Row]
     models: pa.Table
+
+
+@dataclass(frozen=True)
+class Task:
+    """What a learner knows of the robot and its task.
+
+    target_speed_m_per_s   v* of the cost
+    vertical_weight        weight of the vertical velocity in the cost
+    command_range_m        improved actions are clipped to it
+    offset_m, scale_m      u = offset + scale * network
+    reach_m                farthest that a winch comes in a control step
+    world_labels           canonical label of each world label of an action, by symmetry element [elements, nu]
+    mirrored               the symmetry element mirrors the world [elements]
+    """
+
+    target_speed_m_per_s: float
+    vertical_weight: float
+    command_range_m: tuple[float, float]
+    offset_m: float
+    scale_m: float
+    reach_m: float
+    world_labels: Ints
+    mirrored: Flags
+
+    @property
+    def cost_weights(self) -> tuple[float, float]:
+        """v* (m/s) and the weight of the vertical velocity."""
+        return self.target_speed_m_per_s, self.vertical_weight
 
 
 class LearnerPort(Protocol):

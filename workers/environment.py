@@ -25,7 +25,7 @@ except ModuleNotFoundError as error:
     ) from None
 
 from t6gps.storage.errors import ConfigError, DataError, UnsoundStateError
-from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
+from t6gps.storage.schema import OBSERVATION_N, REST_LENGTH_SCALE_M, SENSORS_N
 from t6gps.storage.settings import Settings
 from t6gps.workers.episode.running import RunningEpisode
 from t6gps.workers.episode.stance import check_stance
@@ -34,7 +34,7 @@ from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.engine import Unique
 from t6gps.workers.physics.limits import FASTEST_SOUND_M_PER_S
 from t6gps.workers.robot.neutral import nominal_rest_length
-from t6gps.workers.robot.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE, REST_LENGTH_SCALE_M
+from t6gps.workers.robot.observation import ANGULAR_VELOCITY_SCALE_RAD_PER_S, FARTHEST_NODE
 from t6gps.workers.robot.symmetry import CABLE_MAP
 from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES_N
 from t6gps.workers.settings import RobotSettings, RolloutSettings, TaskSettings, TerrainSettings

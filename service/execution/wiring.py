@@ -5,6 +5,7 @@ from __future__ import annotations
 from typing import Any
 
 from t6gps.learner.learner import Learner
+from t6gps.learner.port import Task
 from t6gps.service.config import Config
 from t6gps.workers.physics.engine import CONTROL_STEP_S
 from t6gps.workers.robot.neutral import nominal_rest_length
@@ -17,9 +18,7 @@ ACTION_SCALE_M = 0.2
 def new_learner(config: Config, **options: Any) -> Learner:
     """The learner of a run, with its first policy."""
     robot = config.robot
-    return Learner(
-        config.learner,
-        run_seed=config.run.seed,
+    task = Task(
         target_speed_m_per_s=config.task.target_speed_m_per_s,
         vertical_weight=config.task.vertical_weight,
         command_range_m=(robot.shortest_command_m, robot.longest_command_m),
@@ -28,6 +27,5 @@ def new_learner(config: Config, **options: Any) -> Learner:
         reach_m=robot.winch_speed_m_per_s * CONTROL_STEP_S,
         world_labels=CABLE_MAP,
         mirrored=~PROPER,
-        keeps_earlier=config.run.pipelined,
-        **options,
     )
+    return Learner(config.learner, task, config.run.seed, keeps_earlier=config.run.pipelined, **options)

@@ -16,6 +16,7 @@ from t6gps.learner.episodes import Episodes
 from t6gps.learner.learner import Learner
 from t6gps.learner.phases import PHASES
 from t6gps.learner.policy import initial
+from t6gps.learner.port import Task
 from t6gps.learner.rows import Rows
 from t6gps.learner.settings import LearnerSettings, ReducedState
 from t6gps.storage import fields, schema
@@ -189,9 +190,7 @@ def make_stays() -> Callable[..., pa.Table]:
 def make_learner() -> Callable[..., Learner]:
     def make(fit_map: Any = map, run_seed: int = 3, keeps_earlier: bool = False, **settings: Any) -> Learner:
         small = {"hidden_layers": (16,), "epochs": 2, "smallest_class_segments": 10, "kl_weight": 0.02}
-        return Learner(
-            LearnerSettings(**small | settings),
-            run_seed=run_seed,
+        task = Task(
             target_speed_m_per_s=0.8,
             vertical_weight=0.1,
             command_range_m=(0.65, 1.35),
@@ -200,9 +199,8 @@ def make_learner() -> Callable[..., Learner]:
             reach_m=0.07,
             world_labels=np.tile(np.arange(24), (24, 1)),
             mirrored=np.arange(24) % 2 == 1,
-            fit_map=fit_map,
-            keeps_earlier=keeps_earlier,
         )
+        return Learner(LearnerSettings(**small | settings), task, run_seed, fit_map, keeps_earlier)
 
     return make
 

@@ -206,7 +206,8 @@ CHANGES = {
 
 
 def test_every_setting_matters(tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Iterate) -> None:
-    elsewhere = {"replay_iterations", "value_from", "action_value"}  # below, and in test_action_value
+    led_by_value = {"value_from", "action_value", "rounds", "models_share", "models_horizon_steps"}
+    elsewhere = {"replay_iterations", *led_by_value}  # below, and in test_action_value
     assert {*CHANGES, *elsewhere} == set(LearnerSettings.model_fields)
     results = []
     for change in [{}, *({name: value} for name, value in CHANGES.items())]:

@@ -9,14 +9,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from t6gps.storage.schema import OBSERVATION_N
+from t6gps.storage.schema import NODE_SCALE_M, OBSERVATION_N, REST_LENGTH_SCALE_M
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.physics import _observer
 from t6gps.workers.robot.observation import (
     ANGULAR_VELOCITY_SCALE_RAD_PER_S,
     FARTHEST_NODE,
-    NODE_SCALE_M,
-    REST_LENGTH_SCALE_M,
     SLOWEST_TRACK_M_PER_S,
 )
 from t6gps.workers.robot.state import RobotState

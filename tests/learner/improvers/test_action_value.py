@@ -124,6 +124,34 @@ def test_the_slope_is_that_of_the_value(value: ActionValue) -> None:
         assert (within < REACH_M) == (slope[:, winch] != 0).any()
 
 
+def test_the_slope_in_the_state_is_that_of_the_value_with_the_command_held(value: ActionValue) -> None:
+    """x = [velocity; nodes; rest lengths]; rest lengths move e as well."""
+    rows = np.arange(50)
+    inputs, rest = planted(0).take(rows)
+    command = torch.from_numpy(policy.act(untrained(), inputs[:, : schema.OBSERVATION_N].numpy()))
+
+    def at(change: torch.Tensor) -> torch.Tensor:
+        velocity, nodes, rests = change.split([3, 36, 24])
+        moved = inputs.clone()
+        moved[:, schema.OBSERVATION_N : schema.OBSERVATION_N + 3] += velocity
+        moved[:, schema.NODES] += nodes / schema.NODE_SCALE_M
+        moved[:, schema.REST_LENGTHS] += rests / schema.REST_LENGTH_SCALE_M
+        moved[:, MOVED] = ((command - rest - rests) / REACH_M).clamp(-1, 1)
+        return value.values(moved)
+
+    slope, step = torch.from_numpy(value.state_slopes(untrained())[rows]), 3e-3
+    for entry in range(63):
+        change = torch.zeros(63)
+        change[entry] = step
+        difference = (at(change) - at(-change)) / (2 * step)
+        smooth = torch.ones(50, dtype=torch.bool)
+        if entry >= 39:
+            winch = entry - 39
+            smooth = ((command - rest)[:, winch].abs() - REACH_M).abs() > step
+        assert torch.allclose(difference[smooth], slope[smooth, entry], rtol=0.02, atol=0.02)
+    assert slope.abs().max() > 0.1
+
+
 def test_the_last_row_of_an_episode_is_no_transition(value: ActionValue) -> None:
     """What stands in it besides its state is never read: spoil it."""
     spoiled = planted(0)
@@ -219,7 +247,8 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    led_by = {"value_from": 1, "action_value": ActionValueSettings(steps=30, first_steps=30, remembered_iterations=2)}
+    few = ActionValueSettings(steps=30, first_steps=30, remembered_iterations=2, critics=2)
+    led_by = {"value_from": 1, "action_value": few, "rounds": 2, "models_share": 0.5}
     moving = [with_motion(table, number) for number, table in enumerate(tables)]
     kept: dict[int, list[pa.Table]] = {}
     monkeypatch.setattr(
@@ -239,11 +268,39 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
         assert differs == (iteration >= 1)
 
 
+def test_what_leads_with_the_value_matters(
+    tables: list[pa.Table], make_learner: Callable[..., Learner], iterate: Callable[[Learner, list[pa.Table]], None]
+) -> None:
+    few = ActionValueSettings(steps=30, first_steps=30)
+    led_by = {"value_from": 1, "action_value": few, "models_share": 0.5, "models_horizon_steps": 2, "rounds": 1}
+    changes = [{}, {"models_share": 0.0}, {"models_horizon_steps": 1}, {"rounds": 2}]
+    made = set()
+    for change in changes:
+        learner = make_learner(**led_by | change)
+        for _ in range(2):
+            iterate(learner, [with_motion(table, number) for number, table in enumerate(tables)])
+        made.add(learner.snapshot.layers[0][0].tobytes())
+    assert len(made) == len(changes)
+
+
+@pytest.mark.parametrize(
+    ("wrong", "said"),
+    [
+        ({"rounds": 2}, "need an action value; set value_from"),
+        ({"models_share": 0.5}, "need an action value; set value_from"),
+        ({"models_share": 0.5, "value_from": 1, "reduced_state": "com"}, "models_share needs reduced_state = nodes"),
+    ],
+)
+def test_settings_that_exclude_each_other_are_refused(wrong: dict[str, Any], said: str) -> None:
+    with pytest.raises(ValueError, match=said):
+        LearnerSettings(**wrong)
+
+
 SMALL = {"hidden_layers": (8,), "batch": 16, "steps": 3, "first_steps": 5}
 CHANGES = {
     "remembered_iterations": 1, "discount": 0.5, "hidden_layers": (9,), "batch": 17, "steps": 4, "first_steps": 6,
     "learning_rate": 2e-3, "weight_decay": 0.5, "target_rate": 0.5, "own_heading_share": 1.0, "step_weight": 0.1,
-    "ascents": 2, "ascent_rate": 0.25,
+    "ascents": 2, "ascent_rate": 0.25, "critics": 2,
 }  # fmt: skip
 
 
