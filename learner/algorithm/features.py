@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, fields
+from typing import Any
 
 import numpy as np
 import pyarrow as pa
@@ -72,7 +73,7 @@ class Canonical:
 
 def rows_of(columns: Columns, **others: AnyArray) -> Rows:
     """Rows of the columns that are named after their parts, and of others."""
-    named = {part.name: columns[part.name] for part in fields(Rows) if part.name in columns}
+    named: dict[str, Any] = {part.name: columns[part.name] for part in fields(Rows) if part.name in columns}
     return Rows(**named | others)
 
 
