@@ -13,7 +13,7 @@ from t6gps.service.api import asking
 from t6gps.service.training import origin
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, DataError
+from t6gps.storage.errors import ConfigError, DataError, QueryError
 from t6gps.storage.exports import dataset, selection
 from t6gps.storage.exports.card import Asked
 from t6gps.storage.exports.dataset import FORMATS, Exported
@@ -62,7 +62,11 @@ def _sources(root: Path, pattern: str, where: str | None, warn: Callable[[str], 
     condition = "true" if where is None else where
     sql = f"SELECT run, episode_id FROM episodes JOIN runs USING (run) WHERE (\n{condition}\n) ORDER BY run, episode_id"
     chosen: dict[str, list[int]] = {}
-    for row in query(asking.question(root, pattern, sql, {}, warn)).to_pylist():
+    try:
+        found = query(asking.question(root, pattern, sql, {}, warn))
+    except QueryError as error:
+        raise QueryError(f"the condition {condition!r} cannot be asked: {error}") from None
+    for row in found.to_pylist():
         chosen.setdefault(row["run"], []).append(row["episode_id"])
     if not chosen:
         which = (

@@ -34,11 +34,11 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
     steps_n = sum(sum(source.summaries.column("steps").to_pylist()) for source in sources)
     parts = [
         f"---\nlicense: {asked.license.lower()}\npretty_name: {name}\ntask_categories: [robotics, "
-        f"reinforcement-learning]\ntags: [robotics, tensegrity, superball, {form.title.split()[0]}]\n---\n",
+        f"reinforcement-learning]\ntags: [robotics, tensegrity, superball, {form.package}]\n---\n",
         f"# {name}\n",
         f"{episodes_n} episodes, {steps_n} control steps of {1 / views.STEPS_PER_S:g} s, of {len(sources)} runs: "
         "SUPERball, a simulated tensegrity robot of six bars and 24 cables, rolls towards waypoints. "
-        f"Format: {form.title}. Written by {asked.made_by}.\n",
+        f"Here they are {form.title}, written by {asked.made_by}.\n",
         f"Licence: {asked.license}.\n",
         f"```python\n{form.opening.format(path='.')}```\n",
         f"## Rows and columns\n\n{form.alignment}\n",
@@ -64,7 +64,7 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
 
 
 def _described(form: Format) -> list[tuple[object, ...]]:
-    rows = views.described({form.title: form.columns}).to_pylist()
+    rows = views.described({form.package: form.columns}).to_pylist()
     return [(f"`{row['column_name']}`", row["type"], row["unit"], row["meaning"]) for row in rows]
 
 

@@ -20,7 +20,8 @@ Write: TypeAlias = Callable[[Path, str, Iterator[Numbered]], Totals]
 class Format:
     """A format in which episodes leave.
 
-    title        what it is called
+    title        what it is, in words
+    package      what opens it
     write        writes it
     columns      what an episode is made of there: type, unit and meaning
     alignment    how states, actions and what followed stand to each other, in sentences
@@ -30,6 +31,7 @@ class Format:
     """
 
     title: str
+    package: str
     write: Write
     columns: pa.Schema
     alignment: str

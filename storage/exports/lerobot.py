@@ -190,7 +190,8 @@ _TASKS_OF_PANDAS = {
 """LeRobot reads the tasks with pandas, which takes from here that the texts are its index."""
 
 FORMAT = Format(
-    title="LeRobot 3.0",
+    title="a LeRobot dataset, version 3.0",
+    package="LeRobot",
     write=write,
     columns=COLUMNS,
     alignment=(

@@ -78,7 +78,8 @@ def _columns(moved: Transitions) -> dict[str, np.ndarray]:
 
 TEXT = "Episodes of SUPERball, a simulated tensegrity robot; README.md has columns, units, statistics and origin."
 FORMAT = Format(
-    title="Minari",
+    title="a Minari dataset, in a folder NAME-v0",
+    package="Minari",
     write=_write,
     columns=COLUMNS,
     alignment=(

@@ -28,7 +28,8 @@ def _table(numbered: Numbered) -> pa.Table:
 
 
 FORMAT = Format(
-    title="Parquet",
+    title="plain Parquet, with every column",
+    package="Parquet",
     write=_write,
     columns=COLUMNS,
     alignment=(

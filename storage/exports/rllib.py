@@ -53,7 +53,8 @@ def _table(numbered: Numbered) -> pa.Table:
 
 
 FORMAT = Format(
-    title="RLlib",
+    title="offline data of RLlib",
+    package="RLlib",
     write=_write,
     columns=COLUMNS,
     alignment=(

@@ -78,8 +78,7 @@ class _Rows:
         self._run = source.run
         chosen = pc.field("episode_id").isin(source.summaries.column("episode_id").combine_chunks())
         found = tables.files(source.run, ["frames"])["frames"]
-        scanner = parquet.rows("frames", found).scanner(filter=chosen, fragment_readahead=1, batch_readahead=2)
-        self._batches = scanner.to_batches()
+        self._groups = parquet.row_groups("frames", found.paths, chosen)
         self._held = schema.FRAMES.empty_table()
 
     def frames(self, summary: Mapping[str, int]) -> pa.Table:
@@ -87,8 +86,8 @@ class _Rows:
         number, rows_n = summary["episode_id"], summary["steps"] + 1
         where = f"run {self._run.name}, episode {number}"
         with log.readable(self._run, "frames"):
-            while self._held.num_rows < rows_n and (batch := next(self._batches, None)) is not None:
-                self._held = pa.concat_tables([self._held, pa.Table.from_batches([batch]).cast(schema.FRAMES)])
+            while self._held.num_rows < rows_n and (group := next(self._groups, None)) is not None:
+                self._held = pa.concat_tables([self._held, group.cast(schema.FRAMES)])
         found, self._held = self._held.slice(0, rows_n).combine_chunks(), self._held.slice(rows_n)
         steps, of = (found.column(name).to_numpy() for name in ("step", "episode_id"))
         if not np.array_equal(steps, np.arange(rows_n)) or (of != number).any():

@@ -8,18 +8,13 @@ from typing import Annotated
 import typer
 
 from t6gps.service import config as configuration
+from t6gps.service.api import exporting
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root
 from t6gps.service.views import terminal
 from t6gps.storage.errors import ConfigError
 
 EXPORT_SECTIONS = ("robot.", "terrain.")
 export = typer.Typer(no_args_is_help=True, help="Write episodes, or the robot, for other programs.")
-EPISODE_FORMATS = {
-    "lerobot": "a LeRobot dataset of version 3.0",
-    "minari": "a Minari dataset; OUT is called NAME-v0",
-    "rllib": "offline data of RLlib",
-    "parquet": "plain Parquet with every column",
-}
 
 
 def add_to(app: typer.Typer) -> None:
@@ -58,13 +53,13 @@ def _episodes(
     where: Annotated[
         str | None, typer.Option(metavar="SQL", help="Condition over `episodes` and `runs` that episodes meet.")
     ] = None,
-    license_: Annotated[str, typer.Option("--license", metavar="SPDX", help="Licence of the data.")] = "MIT",
+    license_: Annotated[
+        str, typer.Option("--license", metavar="SPDX", help="Licence of the data.")
+    ] = exporting.LICENSE,
     root: Root = DEFAULT_ROOT,
 ) -> None:
-    from t6gps.service.api.exporting import export as exported
-
     with terminal.task("exporting") as progress:
-        done = exported(
+        done = exporting.export(
             str(context.info_name),
             out,
             root=root,
@@ -80,5 +75,5 @@ def _episodes(
     typer.echo(out)
 
 
-for form, words in EPISODE_FORMATS.items():
-    export.command(form, help=f"Write episodes of training as {words}.")(_episodes)
+for name, form in exporting.FORMATS.items():
+    export.command(name, help=f"Write episodes of training as {form.title}.")(_episodes)
