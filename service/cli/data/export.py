@@ -12,6 +12,7 @@ from t6gps.service.api import exporting
 from t6gps.service.cli.options import DEFAULT_ROOT, Overrides, Root
 from t6gps.service.views import terminal
 from t6gps.storage.errors import ConfigError
+from t6gps.storage.exports.dataset import FORMATS
 
 EXPORT_SECTIONS = ("robot.", "terrain.")
 export = typer.Typer(no_args_is_help=True, help="Write episodes, or the robot, for other programs.")
@@ -75,5 +76,5 @@ def _episodes(
     typer.echo(out)
 
 
-for name, form in exporting.FORMATS.items():
+for name, form in FORMATS.items():
     export.command(name, help=f"Write episodes of training as {form.title}.")(_episodes)
