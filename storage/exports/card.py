@@ -5,6 +5,9 @@ from __future__ import annotations
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 
+import pyarrow as pa
+import yaml
+
 from t6gps.storage import schema
 from t6gps.storage.exports.format import Format
 from t6gps.storage.exports.selection import Source
@@ -33,16 +36,15 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
     episodes_n = sum(source.summaries.num_rows for source in sources)
     steps_n = sum(sum(source.summaries.column("steps").to_pylist()) for source in sources)
     parts = [
-        f"---\nlicense: {asked.license.lower()}\npretty_name: {name}\ntask_categories: [robotics, "
-        f"reinforcement-learning]\ntags: [robotics, tensegrity, superball, {form.package}]\n---\n",
+        _front_matter(name, form, asked),
         f"# {name}\n",
-        f"{episodes_n} episodes, {steps_n} control steps of {1 / views.STEPS_PER_S:g} s, of {len(sources)} runs: "
+        f"{episodes_n} episodes of {steps_n} control steps of {1 / views.STEPS_PER_S:g} s, runs: {len(sources)}. "
         "SUPERball, a simulated tensegrity robot of six bars and 24 cables, rolls towards waypoints. "
         f"Here they are {form.title}, written by {asked.made_by}.\n",
         f"Licence: {asked.license}.\n",
         f"```python\n{form.opening.format(path='.')}```\n",
         f"## Rows and columns\n\n{form.alignment}\n",
-        _table(("column", "type", "unit", "meaning"), _described(form)),
+        _columns(form.columns),
         f"Numbers of canonical quantities are in the frame of the support triangle: cables and nodes are permuted by a "
         f"symmetry, the world is mirrored and turned. `{form.statistics}` has the statistics of each entry, and "
         "`episodes.parquet` the run of each episode, its seeds and how it went.\n",
@@ -51,7 +53,7 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
         "## Statistics\n",
         _table(("column", "entries", "numbers each", "least", "mean", "deviation", "greatest"), _statistics(totals)),
         "## Episodes\n",
-        _table(("column", "type", "unit", "meaning"), _rows_of_episodes()),
+        _columns(schema.EPISODES),
         "## Where they come from\n",
         f"Runs `{asked.runs}`, "
         + ("all episodes" if asked.where is None else "episodes that meet the condition below")
@@ -63,14 +65,22 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
     return "\n".join(part for part in parts if part)
 
 
-def _described(form: Format) -> list[tuple[object, ...]]:
-    rows = views.described({form.package: form.columns}).to_pylist()
-    return [(f"`{row['column_name']}`", row["type"], row["unit"], row["meaning"]) for row in rows]
+def _front_matter(name: str, form: Format, asked: Asked) -> str:
+    facts: dict[str, object] = {
+        "license": asked.license.lower(),
+        "pretty_name": name,
+        "task_categories": ["robotics", "reinforcement-learning"],
+        "tags": ["tensegrity", "superball", form.package],
+    }
+    if form.viewer is not None:
+        facts["configs"] = [{"config_name": "default", "data_files": form.viewer}]
+    return f"---\n{yaml.safe_dump(facts, sort_keys=False)}---\n"
 
 
-def _rows_of_episodes() -> list[tuple[object, ...]]:
-    rows = views.described({"episodes": schema.EPISODES}).to_pylist()
-    return [(f"`{row['column_name']}`", row["type"], row["unit"], row["meaning"]) for row in rows]
+def _columns(definition: pa.Schema) -> str:
+    rows = views.described({"": definition}).to_pylist()
+    cells = [(f"`{row['column_name']}`", row["type"], row["unit"], row["meaning"]) for row in rows]
+    return _table(("column", "type", "unit", "meaning"), cells)
 
 
 def _statistics(totals: Totals) -> list[tuple[object, ...]]:

@@ -26,6 +26,7 @@ class Format:
     columns      what an episode is made of there: type, unit and meaning
     alignment    how states, actions and what followed stand to each other, in sentences
     opening      Python that opens the dataset {path} with the foreign package
+    viewer       its Parquet files with rows, for viewers of Hugging Face; None without
     losses       what of a run it does not hold, in sentences
     statistics   the file of the dataset that has them
     """
@@ -37,4 +38,5 @@ class Format:
     alignment: str
     opening: str
     losses: tuple[str, ...]
+    viewer: str | None
     statistics: str = "statistics.json"

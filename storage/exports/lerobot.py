@@ -207,5 +207,6 @@ FORMAT = Format(
         "States are there as the policy's observations; other columns of `frames` are not.",
         "LeRobot's tensors have 32 bits: of `next.reward` only the files have 64.",
     ),
+    viewer="data/*/*.parquet",
     statistics="meta/stats.json",
 )

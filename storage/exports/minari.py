@@ -91,4 +91,5 @@ FORMAT = Format(
         "States are there as the policy's observations, with a few infos; other columns of `frames` are not.",
         "It names no environment: actions are rest lengths in metres, those of `t6gps/SuperBall-v0` lie in -1 .. 1.",
     ),
+    viewer=None,
 )

@@ -38,4 +38,5 @@ FORMAT = Format(
     ),
     opening='import pyarrow.parquet as pq\n\nframes = pq.read_table("{path}/frames")\n',
     losses=(),
+    viewer="frames/*.parquet",
 )

@@ -69,4 +69,5 @@ FORMAT = Format(
         "States are there as the policy's observations; other columns of `frames` are not.",
         "RLlib's tensors have 32 bits: of `rewards` only the files have 64.",
     ),
+    viewer="data/*.parquet",
 )

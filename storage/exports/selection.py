@@ -12,6 +12,7 @@ import pyarrow.compute as pc
 from t6gps.storage import fields, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
+from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode
 
 NUMBER = fields.scalar("episode_index", pa.int64(), "1", "number of the episode, counted from 0 over all runs")
@@ -78,6 +79,7 @@ class _Rows:
         self._run = source.run
         chosen = pc.field("episode_id").isin(source.summaries.column("episode_id").combine_chunks())
         found = tables.files(source.run, ["frames"])["frames"]
+        self._paths = found.paths
         self._groups = parquet.row_groups("frames", found.paths, chosen)
         self._held = schema.FRAMES.empty_table()
 
@@ -92,4 +94,11 @@ class _Rows:
         steps, of = (found.column(name).to_numpy() for name in ("step", "episode_id"))
         if not np.array_equal(steps, np.arange(rows_n)) or (of != number).any():
             raise log.damaged(self._run, "frames", f"{where}: its {rows_n} frames are not there, one for each step")
-        return fields.check(found, schema.FRAMES, where)
+        try:
+            return fields.check(found, schema.FRAMES, where)
+        except DataError as error:
+            version = parquet.version(self._paths[0])
+            raise DataError(
+                f"{error}; it is of version {version} of the tables, this version, {schema.SCHEMA_VERSION}, has other "
+                "columns; leave its run out with --run or --where"
+            ) from None

@@ -70,7 +70,7 @@ def _episodes(
             progress=progress,
             warn=terminal.warn,
         )
-    terminal.say(f"{done.episodes} episodes, {done.steps} control steps of {done.runs} runs, licence {license_}")
+    terminal.say(f"{done.episodes} episodes, {done.steps} control steps, runs: {done.runs}, licence: {license_}")
     for loss in done.losses:
         terminal.say(f"not held: {loss}")
     typer.echo(out)

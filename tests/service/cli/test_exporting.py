@@ -44,7 +44,7 @@ def test_runs_of_a_pattern_become_one_dataset(root: Path, tmp_path: Path, tiny: 
     assert done.stdout.decode() == f"{out}\n"
     warning, counts, *losses = done.stderr.splitlines()
     assert warning.startswith("warning: left out: run rough-broken is not whole")
-    assert counts == "18 episodes, 540 control steps of 2 runs, licence CC-BY-4.0"
+    assert counts == "18 episodes, 540 control steps, runs: 2, licence: CC-BY-4.0"
     assert all(loss.startswith("not held: ") for loss in losses)
     rows = pq.read_table(out / "episodes.parquet")
     own = tables.read(tiny.run, "episodes")

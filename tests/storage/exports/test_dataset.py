@@ -12,6 +12,7 @@ import numpy as np
 import pyarrow as pa
 import pyarrow.parquet as pq
 import pytest
+import yaml
 from minari import MinariDataset
 
 from t6gps.storage import catalog, schema, tables
@@ -189,7 +190,9 @@ def test_every_dataset_says_where_its_episodes_come_from(form: str, sources: lis
     assert {path.name for path in (out / "provenance").iterdir()} == set(CHOSEN)
     assert (out / "provenance" / "walk-0" / "config.json").read_text() == "{}"
     card = (out / "README.md").read_text()
-    assert card.startswith("---\nlicense: cc-by-4.0\n")
+    facts = yaml.safe_load(card.split("---\n")[1])
+    assert (facts["license"], facts["pretty_name"]) == ("cc-by-4.0", NAME)
+    assert all(list(out.glob(config["data_files"])) for config in facts.get("configs", []))
     named = [*FORMATS[form].columns.names, *FORMATS[form].losses, *CHOSEN, "cost > 0", "t6gps 1.2.3", "run.seed"]
     assert not [words for words in named if words not in card]
     assert json.loads((out / FORMATS[form].statistics).read_text()).keys() <= set(FORMATS[form].columns.names)
@@ -231,14 +234,35 @@ def test_what_exists_is_left_as_it_is(make: Callable[[Path], None], sources: lis
     assert [path.name for path in tmp_path.iterdir()] == [NAME]
 
 
-def test_a_run_without_its_frames_is_refused_by_name(runs: list[Run], tmp_path: Path) -> None:
+def without_rows(frames: pa.Table) -> pa.Table:
+    return frames.slice(0, 8)
+
+
+def of_version_3(frames: pa.Table) -> pa.Table:
+    short = pa.array(
+        [row[: schema.SENSORS_N] for row in frames.column("observation").to_pylist()], pa.list_(pa.float32())
+    )
+    older = frames.set_column(frames.schema.get_field_index("observation"), "observation", short)
+    return older.replace_schema_metadata({"t6gps_schema_version": "3"})
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (without_rows, r"damaged.*episode 2: its 6 frames are not there"),
+        (of_version_3, r"episode 0: .* observation must hold 83 numbers; it is of version 3 .*leave its run out"),
+    ],
+)
+def test_frames_that_cannot_leave_are_refused_by_run_and_episode(
+    change: Callable[[pa.Table], pa.Table], words: str, runs: list[Run], tmp_path: Path
+) -> None:
     run = catalog.copy(runs[0], tmp_path / "runs", "damaged")
     file = run.tables / "frames" / "iteration-000000.parquet"
     size_n = file.stat().st_size
-    pq.write_table(pq.read_table(file).slice(0, 8).cast(schema.FRAMES), file)
+    pq.write_table(change(pq.read_table(file)), file)
     log = next((run.tables / "frames" / "_delta_log").glob("*1.json"))
     log.write_text(log.read_text().replace(f'"size":{size_n}', f'"size":{file.stat().st_size}'))
-    with pytest.raises(DataError, match=r"damaged.*episode 2: its 6 frames are not there"):
+    with pytest.raises(DataError, match=words):
         written("parquet", [selection.source(run, [0, 2, 100], {"run": run.name}, {})], tmp_path)
     assert [path.name for path in tmp_path.iterdir()] == ["runs"]
 
