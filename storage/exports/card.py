@@ -38,7 +38,7 @@ def card(name: str, form: Format, asked: Asked, sources: Sequence[Source], total
     parts = [
         _front_matter(name, form, asked),
         f"# {name}\n",
-        f"{episodes_n} episodes of {steps_n} control steps of {1 / views.STEPS_PER_S:g} s, runs: {len(sources)}. "
+        f"{episodes_n} episodes, in all {steps_n} control steps of {1 / views.STEPS_PER_S:g} s; runs: {len(sources)}. "
         "SUPERball, a simulated tensegrity robot of six bars and 24 cables, rolls towards waypoints. "
         f"Here they are {form.title}, written by {asked.made_by}.\n",
         f"Licence: {asked.license}.\n",

@@ -50,6 +50,24 @@ COLUMNS = pa.schema(
         scalar("task_index", pa.int64(), "1", "row of meta/tasks.parquet: there is one task"),
     ]
 )
+_PLACES = [f"{part}/{key}" for part in ("data", "meta/episodes") for key in ("chunk_index", "file_index")]
+_EPISODES = pa.schema(
+    [
+        *(
+            (name, pa.int64())
+            for name in ("episode_index", "length", "dataset_from_index", "dataset_to_index", *_PLACES)
+        ),
+        ("tasks", pa.list_(pa.string())),
+        *((f"stats/{column.name}/count", pa.list_(pa.int64())) for column in COLUMNS),
+        *(
+            (f"stats/{column.name}/{key}", pa.list_(pa.float64()))
+            for column in COLUMNS
+            for key in ("min", "max", "mean", "std", *_QUANTILES)
+        ),
+        schema.RUN,
+        *schema.EPISODES,
+    ]
+)
 _NAMES = {"observation.state": moves.OBSERVATION_NAMES, "action": moves.ACTION_NAMES}
 
 
@@ -80,7 +98,7 @@ def write(folder: Path, name: str, episodes: Iterator[Numbered], file_bytes_n: i
         done = [row for row in written.episodes if row["data/file_index"] == number % FILES_PER_CHUNK_N]
         written.episodes = written.episodes[len(done) :]
         episodes_n += len(done)
-        pq.write_table(pa.Table.from_pylist(done), meta, compression="zstd", write_page_checksum=True)
+        pq.write_table(pa.Table.from_pylist(done, _EPISODES), meta, compression="zstd", write_page_checksum=True)
     _write_meta(folder / "meta", written, episodes_n)
     return written.totals
 
@@ -129,11 +147,10 @@ def _episode(numbered: Numbered, written: _Written, columns: Mapping[str, NDArra
     statistics.add(written.totals, columns)
     for name, numbers in columns.items():
         found = statistics.moments(numbers).to_json()
-        for key, quantile in _QUANTILES.items():
-            value = np.quantile(numbers.reshape(len(numbers), -1).astype(np.float64), quantile, axis=0)
+        rows, sums = numbers.reshape(len(numbers), -1).astype(np.float64), written.quantiles.setdefault(name, {})
+        for key, value in zip(_QUANTILES, np.quantile(rows, list(_QUANTILES.values()), axis=0), strict=True):
             found[key] = value.tolist()
-            sums = written.quantiles.setdefault(name, {})
-            sums[key] = sums.get(key, np.zeros_like(value)) + len(numbers) * value
+            sums[key] = sums.get(key, 0.0) + len(numbers) * value
         row |= {f"stats/{name}/{key}": value for key, value in found.items()}
     return row | numbered.row
 

@@ -138,6 +138,9 @@ def test_lerobot_begins_a_new_file_after_so_many_bytes(sources: list[Source], tm
     files = sorted((folder / "data").rglob("*.parquet"))
     assert len(files) > 2
     assert pa.concat_tables(map(pq.read_table, files)).equals(pq.read_table(one / "data"))
+    known = sorted((folder / "meta" / "episodes").rglob("*.parquet"))
+    assert len({pq.read_schema(file) for file in known}) == 1
+    assert pq.read_schema(known[0]).field("waypoints_reached").type == pa.int32()
     for row in pq.read_table(folder / "meta" / "episodes").to_pylist():
         place = {key: row[f"data/{key}"] for key in ("chunk_index", "file_index")}
         info = json.loads((folder / "meta" / "info.json").read_text())
