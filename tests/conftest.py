@@ -82,7 +82,7 @@ def _make_episode(episode_id: int, iteration: int, steps: int = 5, rng: np.rando
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def make_episode() -> Callable[..., Episode]:
     """A factory of random episodes: make_episode(episode_id, iteration, steps=5, rng=None)."""
     return _make_episode

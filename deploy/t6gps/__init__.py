@@ -6,6 +6,7 @@ The import loads this file alone and changes nothing; a name loads what it needs
 from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
+    from t6gps.service.api.exporting import export
     from t6gps.service.api.policy import Policy
     from t6gps.service.api.run import Run, open_run, runs
     from t6gps.service.api.training import Progress, evaluate, train
@@ -17,6 +18,7 @@ if TYPE_CHECKING:
     __version__: str
 else:
     _MODULES = {
+        "export": "t6gps.service.api.exporting",
         "Policy": "t6gps.service.api.policy",
         "Run": "t6gps.service.api.run",
         "open_run": "t6gps.service.api.run",
@@ -63,6 +65,7 @@ __all__ = [
     "T6GpsError",
     "__version__",
     "evaluate",
+    "export",
     "open_run",
     "presets",
     "runs",

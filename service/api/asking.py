@@ -76,7 +76,7 @@ def _row(run: Run) -> Mapping[str, object]:
             "commit": None if made is None else made.commit,
             "made_at": None if made is None else made.date,
             "schema_version": None if made is None else made.schema_version,
-            **{column: _value(settings, key) for key, column in _COLUMNS.items()},
+            **{column: _value(settings, key) for key, column in SETTINGS.items()},
             **_evaluated(run),
         }
         pa.Table.from_pylist([row], ABOUT.columns)
@@ -145,11 +145,12 @@ def _estimates() -> Iterator[pa.Field]:
 
 
 _SETTINGS = dict(_settings(Config))
-_COLUMNS = {key: column.name for key, column in _SETTINGS.items()}
+SETTINGS = {key: column.name for key, column in _SETTINGS.items()}
+"""The column of `runs` that each setting has, by its dotted key."""
 ABOUT = About(
     pa.schema(
         [
-            *(field for field in views.RUNS if field.name not in _COLUMNS.values()),
+            *(field for field in views.RUNS if field.name not in SETTINGS.values()),
             *_estimates(),
             *_SETTINGS.values(),
         ]

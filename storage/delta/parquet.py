@@ -62,6 +62,14 @@ def groups(file: Path, columns: list[str]) -> Iterator[pa.Table]:
             yield found.read_row_group(number, columns)
 
 
+def row_groups(table: str, paths: list[str], wanted: pc.Expression) -> Iterator[pa.Table]:
+    """The wanted rows of files, a row group at a time; groups that cannot have any are not read. Typed as `rows`."""
+    definition = schema.TABLES[table]
+    for fragment in ds.dataset(paths, definition, format=_VERIFIED).get_fragments():
+        for group in fragment.split_by_row_group(wanted, definition):
+            yield group.to_table(definition, filter=wanted)
+
+
 def holds(file: Path, groups: Iterable[pa.Table]) -> bool:
     """True when the row groups of `file` are these tables."""
     with pq.ParquetFile(file, page_checksum_verification=True) as found:

@@ -59,7 +59,7 @@ def learned(number: int, **changed: Any) -> Learned:
     )
 
 
-@pytest.fixture
+@pytest.fixture(scope="session")
 def learn() -> Callable[..., Learned]:
     """learn(iteration, **parts) is what an iteration leaves beside its episodes."""
     return learned

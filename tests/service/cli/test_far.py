@@ -34,7 +34,7 @@ HERE_ALONE = {
     "bench": "measures this machine",
     "cp": "copies folders of this machine; fetch brings a run from a server",
     "doctor": "looks at this machine",
-    "export": "needs no run",
+    "export": "writes files of this machine, of runs that fetch brings",
     "mv": "moves folders of this machine",
     "repair": "changes folders of this machine, by copies that it sees",
     "schema": "needs no run",
