@@ -120,14 +120,11 @@ def whole(root: Path) -> Path:
     return path
 
 
-def folder(root: Path) -> Path:
-    """The root of a command that writes. RunError for one in an object store."""
-    if place.is_object(root):
-        raise RunError(
-            f"{place.whole(root)} is an object store, whose runs are only read; give a folder as --root, and copy runs "
-            "to and fro with t6gps cp, or with train --publish"
-        )
-    return root
+def folder(path: Path) -> Path:
+    """A root, or a run's folder, of a command that writes. StoreError for one in an object store."""
+    if place.is_object(path):
+        raise place.only_read(place.whole(path))
+    return path
 
 
 def create(
@@ -141,7 +138,7 @@ def create(
     The run appears whole or not at all, and of several processes that create one at the same time each gets its own.
     Raises RunError when the name is refused or taken, or when the root cannot be written.
     """
-    root, contents = whole(folder(root)), {"config.json": config_text.encode(), ".lock": b"", **files}
+    root, contents = whole(root), {"config.json": config_text.encode(), ".lock": b"", **files}
     with drafted(root, name, "create", numbered) as draft:
         for part in (draft.tables, draft.spool, draft.checkpoints, draft.figures):
             part.mkdir()
@@ -166,7 +163,7 @@ def move(run: Run, root: Path, name: str) -> Run:
 
     Between file systems it is copied, then removed.
     """
-    root = whole(root)
+    root = folder(whole(root))
     with locked(run), unevaluated(run):
         try:
             root.mkdir(parents=True, exist_ok=True)
@@ -204,7 +201,7 @@ def discard_unused(run: Run) -> None:
 @contextmanager
 def drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterator[Run]:
     """A hidden folder for a run of that name. RunError where the name is taken, or the root cannot be written."""
-    path = root / check_name(name)
+    path = folder(root) / check_name(name)
     if not numbered and os.path.lexists(path):
         raise _taken(path, what)
     try:
@@ -336,7 +333,7 @@ def unused(run: Run) -> Iterator[None]:
 @contextmanager
 def evaluating(run: Run) -> Iterator[None]:
     """Let nobody copy, move or remove the run meanwhile; others may train and evaluate it."""
-    with (run.path / _EVALUATING).open("a") as file:
+    with (folder(run.path) / _EVALUATING).open("a") as file:
         fcntl.flock(file, fcntl.LOCK_SH)
         yield
 
@@ -366,7 +363,7 @@ def process_of(run: Run) -> int | None:
 
 
 def _lock_file(run: Run, mode: str) -> TextIO:
-    path = run.path / ".lock"
+    path = folder(run.path) / ".lock"
     try:
         return cast(TextIO, path.open(mode, encoding="utf-8"))
     except FileNotFoundError:

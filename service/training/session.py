@@ -212,6 +212,8 @@ def evaluate(
     RunError for a policy that the run does not keep, and before its first one.
     """
     policy = policy or policies.load(run, asked.version)
+    if asked.keep:
+        catalog.folder(run.path)
     with closing(start_executor(config, serial, engine=engine)) as executor:
         if asked.keep:
             occasion = Occasion(Purpose.EVAL, terrain_seed=asked.terrain_seed, engine=engine.value)

@@ -134,10 +134,14 @@ def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, s
 
 
 def examine(run: Run, found: Found, entry: Entry) -> None:
-    """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong."""
+    """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong.
+
+    StoreError where its object store does not answer.
+    """
     try:
         keys = _keys(found.table, entry)
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
+        place.answers(entry.path)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
         found.faults.append(Fault(found.table, within(run, entry.path), what, entry.number))
     else:

@@ -39,7 +39,9 @@ def is_object(path: Path) -> bool:
 
 
 def whole(path: Path) -> ObjectPath:
-    """A place in an object store. RunError for an address that none can have."""
+    """A place in an object store. RunError for an address that none can have, ConfigError without keys or obstore."""
+    store.access()
+    store.require()
     bucket, keys = path.parts[1:2], path.parts[2:]
     if not bucket or not _BUCKET.fullmatch(bucket[0]):
         raise RunError(f"an object store is s3://BUCKET or s3://BUCKET/PREFIX, found {path}; name a bucket")
@@ -63,10 +65,7 @@ class ObjectPath(PosixPath):
         return f"{SCHEME}//{text.removeprefix(f'{SCHEME}/')}" if is_object(self) else text
 
     def __fspath__(self) -> str:
-        raise StoreError(
-            f"{self} is in an object store, whose runs are only read; copy the run to a folder with t6gps cp, and work "
-            "on it there"
-        )
+        raise only_read(self)
 
     @property
     def bucket(self) -> str:
@@ -172,6 +171,14 @@ class ObjectPath(PosixPath):
             raise FileNotFoundError(errno.ENOENT, "no such object", str(self))
         names = [prefix.rstrip("/").rpartition("/")[2] for prefix in found["common_prefixes"]]
         return names, {each["path"].rpartition("/")[2]: each["size"] for each in found["objects"]}
+
+
+def only_read(path: ObjectPath) -> StoreError:
+    """The error of what would write there."""
+    return StoreError(
+        f"{path} is in an object store, which is only read; give a folder as the root, or copy the run to one with "
+        "t6gps cp"
+    )
 
 
 def _stat(kind: int, size: int, changed: datetime) -> os.stat_result:

@@ -21,7 +21,7 @@ from typing import Literal
 from t6gps.storage import checkpoint, durable, schema
 from t6gps.storage.errors import RunError, StoreError
 from t6gps.storage.objects import store
-from t6gps.storage.objects.place import ObjectPath
+from t6gps.storage.objects.place import ObjectPath, answers, below
 
 FIXED = ("config.json", "origin.json", "ground")
 """What a run is created with; it says whose an object is."""
@@ -42,6 +42,20 @@ class _Step:
     created: bool = True
 
 
+@dataclass(frozen=True, order=True)
+class _Commit:
+    """A commit to a table, in the order in which commits are copied: one iteration after the other.
+
+    number   of its iteration or evaluation; -1 for the commit that makes the table
+    files    what it adds, then its own entry of the log
+    """
+
+    of_evaluations: bool
+    number: int
+    last: bool
+    files: tuple[str, ...]
+
+
 def probe(root: ObjectPath) -> None:
     """See that objects can be made below a root, and that none replaces another unasked. StoreError where they can.
 
@@ -49,6 +63,7 @@ def probe(root: ObjectPath) -> None:
     """
     import obstore
 
+    answers(root)  # some stores make a bucket that is written to
     trial = root / f".probe-{secrets.token_hex(8)}"
     _put(trial, b"1", created=True)
     try:
@@ -110,22 +125,22 @@ def iterations(run: Path) -> int:
 
 
 def _check_same(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
-    another = RunError(f"{target} holds another run of that name; choose another name with --run, or another prefix")
+    another = RunError(f"{target} holds another run of that name; choose another name or prefix")
     fixed = [file for file in there if file.startswith(FIXED)]
-    entries = [file for file in there if "/_delta_log/" in file]
-    newest = {PurePosixPath(file).parent: file for file in sorted(entries)}.values()
-    for file in (*fixed, *entries):
-        if not (run / file).is_file():
-            if file in entries and all((run / each).is_file() for each in fixed):
-                raise RunError(
-                    f"{target} has more of the run than {run}: {file}; copy it from there, and go on with it"
-                )
-            raise another
-        if (run / file).stat().st_size != there[file]:
-            raise another
-    for file in (*fixed, *newest):
-        if (run / file).read_bytes() != (target / file).read_bytes():
-            raise another
+    entries = sorted(file for file in there if "/_delta_log/" in file)
+    newest = {PurePosixPath(file).parent: file for file in entries}.values()
+    here = below(run)
+    if any(here.get(file) != there[file] or not _same(run, target, file) for file in fixed):
+        raise another
+    more = [file for file in entries if file not in here]
+    if more:
+        raise RunError(f"{target} has more of the run than {run}: {more[0]}; copy it from there, and go on with it")
+    if any(here[file] != there[file] for file in entries) or not all(_same(run, target, file) for file in newest):
+        raise another
+
+
+def _same(run: Path, target: ObjectPath, file: str) -> bool:
+    return (run / file).read_bytes() == (target / file).read_bytes()
 
 
 def _steps(run: Path, there: Mapping[str, int], without: tuple[str, ...]) -> list[_Step]:
@@ -136,17 +151,29 @@ def _steps(run: Path, there: Mapping[str, int], without: tuple[str, ...]) -> lis
     """
     states = [f"checkpoints/{path.name}" for path in checkpoint.kept(run / "checkpoints").values()]
     others = [_Step(file, created=False) for file in _others(run, without)]
-    last = {table: _entries(run, table) for table in LAST}
-    tables = {table: _entries(run, table) for table in schema.TABLES if table not in LAST} | last
+    looked = [_commits(run, table, there) for table in sorted(schema.TABLES, key=lambda table: table not in LAST)]
+    commits = sorted(commit for commits in looked for commit in commits)
     steps = [_Step(file) for file in _files(run) if file.startswith(FIXED) and file not in there]
-    for table, entries in tables.items():
-        left = (entry for entry in entries if entry.relative_to(run).as_posix() not in there)
-        steps += [_Step(file) for entry in left for file in _named(run, table, entry)]
+    steps += [_Step(file) for commit in commits for file in commit.files]
     steps += others
     for state in (state for state in states if f"{state}/DONE" not in there):
         files = (_Step(f"{state}/{name}", created=False) for name in ("arrays.npz", "manifest.json"))
         steps += [*files, _Step(f"{state}/DONE")]
     return steps
+
+
+def _commits(run: Path, table: str, there: Mapping[str, int]) -> list[_Commit]:
+    """The commits to a table that are not there."""
+    entries = sorted((run / "tables" / table / "_delta_log").glob("*.json"))
+    left = {entry.relative_to(run).as_posix(): entry for entry in entries}
+    return [_commit(table, file, entry) for file, entry in left.items() if file not in there]
+
+
+def _commit(table: str, file: str, entry: Path) -> _Commit:
+    actions = [json.loads(line) for line in entry.read_text(encoding="utf-8").splitlines()]
+    number = next((action["txn"]["version"] for action in actions if "txn" in action), -1)
+    data = (f"tables/{table}/{action['add']['path']}" for action in actions if "add" in action)
+    return _Commit(table in schema.OF_EVALUATIONS, number, table in LAST, (*data, file))
 
 
 def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:
@@ -160,19 +187,6 @@ def _files(run: Path) -> list[str]:
     """Files by their paths in the run, without hidden ones: locks, and what is not finished."""
     places = (path.relative_to(run) for path in sorted(run.rglob("*")) if path.is_file())
     return [place.as_posix() for place in places if not any(part.startswith(".") for part in place.parts)]
-
-
-def _entries(run: Path, table: str) -> list[Path]:
-    return sorted((run / "tables" / table / "_delta_log").glob("*.json"))
-
-
-def _named(run: Path, table: str, entry: Path) -> Iterator[str]:
-    """The files that an entry of a log adds, then the entry."""
-    for line in entry.read_text(encoding="utf-8").splitlines():
-        action = json.loads(line)
-        if "add" in action:
-            yield f"tables/{table}/{action['add']['path']}"
-    yield entry.relative_to(run).as_posix()
 
 
 def _copy(run: Path, target: ObjectPath, step: _Step, there: Mapping[str, int]) -> None:

@@ -91,17 +91,23 @@ def options(reached: Access) -> dict[str, str]:
     return {key: value for key, value in named.items() if value is not None}
 
 
+def require() -> None:
+    """ConfigError where obstore is not installed."""
+    try:
+        import obstore  # noqa: F401 # it is only looked for
+    except ModuleNotFoundError as error:
+        raise ConfigError(f"s3:// needs {error.name}; install it with: pip install 't6gps[s3]'") from None
+
+
 def client(bucket: str, timeout_s: int = READ_S) -> S3Store:
-    """Obstore's client of a bucket. ConfigError where obstore is not installed, or as `access`."""
+    """Obstore's client of a bucket. ConfigError as `access`."""
     return _client(bucket, timeout_s, access())
 
 
 @lru_cache
 def _client(bucket: str, timeout_s: int, reached: Access) -> S3Store:
-    try:
-        from obstore.store import S3Store
-    except ModuleNotFoundError as error:
-        raise ConfigError(f"s3:// needs {error.name}; install it with: pip install 't6gps[s3]'") from None
+    from obstore.store import S3Store
+
     return S3Store(
         bucket,
         config=options(reached),  # type: ignore[arg-type]  # it takes any of its keys
@@ -174,7 +180,8 @@ def explained(error: Exception, bucket: str) -> StoreError:
         )
     if said is not None and not said.startswith("status 5"):
         return StoreError(f"{name} has answered {said} for the bucket {bucket!r}; see whether it is an S3 store")
-    reason = (said or " ".join(text.split("\n\nDebug source", maxsplit=1)[0].split()))[:300]
+    sentence = " ".join(text.split("\n\nDebug source", maxsplit=1)[0].split())
+    reason = (said or sentence.rpartition(" - ")[2])[:300]
     return StoreUnreachableError(
         f"{name} does not answer for the bucket {bucket!r}: {reason}; see AWS_ENDPOINT_URL and the network, then repeat"
     )
