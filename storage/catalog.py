@@ -33,6 +33,7 @@ from typing import TextIO, cast
 
 from t6gps.storage import durable
 from t6gps.storage.errors import RunError
+from t6gps.storage.objects import place
 
 NAME_LENGTH_N = 64
 GLANCE_S = 0.5
@@ -103,8 +104,11 @@ def check_name(name: str) -> str:
 def whole(root: Path) -> Path:
     """A root as every process knows it, wherever it works: absolute, without '~', links or '..'.
 
-    Raises RunError for one that has no such path, or one that the tables could not open.
+    An object store's is s3://BUCKET/PREFIX, however many slashes a Path has left of it. Raises RunError for one that
+    has no such path, or one that the tables could not open.
     """
+    if place.is_object(root):
+        return place.whole(root)
     try:
         path = root.expanduser().resolve()
     except RuntimeError as error:
@@ -113,6 +117,13 @@ def whole(root: Path) -> Path:
         raise RunError(
             f"the root's path must have no '%', which the Delta tables would decode, found {path}; rename it"
         )
+    return path
+
+
+def folder(path: Path) -> Path:
+    """A root, or a run's folder, of a command that writes. StoreError for one in an object store."""
+    if place.is_object(path):
+        raise place.only_read(place.whole(path))
     return path
 
 
@@ -128,23 +139,23 @@ def create(
     Raises RunError when the name is refused or taken, or when the root cannot be written.
     """
     root, contents = whole(root), {"config.json": config_text.encode(), ".lock": b"", **files}
-    with _drafted(root, name, "create", numbered) as draft:
-        for folder in (draft.tables, draft.spool, draft.checkpoints, draft.figures):
-            folder.mkdir()
-        for place, content in contents.items():
-            path = draft.path / place
+    with drafted(root, name, "create", numbered) as draft:
+        for part in (draft.tables, draft.spool, draft.checkpoints, draft.figures):
+            part.mkdir()
+        for file, content in contents.items():
+            path = draft.path / file
             path.parent.mkdir(exist_ok=True)
             path.write_bytes(content)
-        return _claimed(draft, root, name, "create", numbered)
+        return claimed(draft, root, name, "create", numbered)
 
 
 def copy(run: Run, root: Path, name: str) -> Run:
     """Copy a run that nobody uses, whole or not at all. Raises RunError as `create`, and where the run is in use."""
     root = whole(root)
-    with _unused(run), unevaluated(run), _drafted(root, name, "copy") as draft:
+    with unused(run), unevaluated(run), drafted(root, name, "copy") as draft:
         shutil.copytree(run.path, draft.path, dirs_exist_ok=True, ignore=shutil.ignore_patterns(".*"))
         (draft.path / ".lock").touch()
-        return _claimed(draft, root, name, "copy")
+        return claimed(draft, root, name, "copy")
 
 
 def move(run: Run, root: Path, name: str) -> Run:
@@ -152,7 +163,7 @@ def move(run: Run, root: Path, name: str) -> Run:
 
     Between file systems it is copied, then removed.
     """
-    root = whole(root)
+    root = folder(whole(root))
     with locked(run), unevaluated(run):
         try:
             root.mkdir(parents=True, exist_ok=True)
@@ -177,8 +188,7 @@ def remove(run: Run) -> None:
 
 def size(run: Run) -> int:
     """Bytes of a run's files."""
-    files = (Path(folder) / name for folder, _, names in os.walk(run.path) for name in names)
-    return sum(file.stat().st_size for file in files if file.is_file())
+    return sum(place.below(run.path).values())
 
 
 def discard_unused(run: Run) -> None:
@@ -189,9 +199,9 @@ def discard_unused(run: Run) -> None:
 
 
 @contextmanager
-def _drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterator[Run]:
+def drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterator[Run]:
     """A hidden folder for a run of that name. RunError where the name is taken, or the root cannot be written."""
-    path = root / check_name(name)
+    path = folder(root) / check_name(name)
     if not numbered and os.path.lexists(path):
         raise _taken(path, what)
     try:
@@ -207,7 +217,7 @@ def _drafted(root: Path, name: str, what: str, numbered: bool = False) -> Iterat
         ) from error
 
 
-def _claimed(draft: Run, root: Path, name: str, what: str, numbered: bool = False) -> Run:
+def claimed(draft: Run, root: Path, name: str, what: str, numbered: bool = False) -> Run:
     """The run that a draft becomes, under its name or the first number that is free. RunError when it is taken."""
     durable.sync_tree(draft.path)
     numbers = itertools.count(2) if numbered else ()
@@ -309,7 +319,7 @@ def locked(run: Run) -> Iterator[None]:
 
 
 @contextmanager
-def _unused(run: Run) -> Iterator[None]:
+def unused(run: Run) -> Iterator[None]:
     """Let nobody train the run meanwhile; this writes nothing. Raises RunError where somebody does."""
     if not (run.path / ".lock").exists():  # nobody has ever used it
         yield
@@ -323,7 +333,7 @@ def _unused(run: Run) -> Iterator[None]:
 @contextmanager
 def evaluating(run: Run) -> Iterator[None]:
     """Let nobody copy, move or remove the run meanwhile; others may train and evaluate it."""
-    with (run.path / _EVALUATING).open("a") as file:
+    with (folder(run.path) / _EVALUATING).open("a") as file:
         fcntl.flock(file, fcntl.LOCK_SH)
         yield
 
@@ -353,7 +363,7 @@ def process_of(run: Run) -> int | None:
 
 
 def _lock_file(run: Run, mode: str) -> TextIO:
-    path = run.path / ".lock"
+    path = folder(run.path) / ".lock"
     try:
         return cast(TextIO, path.open(mode, encoding="utf-8"))
     except FileNotFoundError:

@@ -33,6 +33,14 @@ class ServerError(T6GpsError):
     """A server that cannot be started or reached, or that refuses who asks: token, scope, origin, size, rate."""
 
 
+class StoreError(T6GpsError):
+    """An object store that refuses what is asked of it: keys, bucket, address, what may be written."""
+
+
+class StoreUnreachableError(StoreError):
+    """An object store that does not answer, and may later."""
+
+
 class TerrainError(T6GpsError):
     """A terrain that cannot be built or stood on."""
 

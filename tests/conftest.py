@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 from typing import Any
 
 import house
 import numpy as np
+import object_stores
 import pyarrow as pa
 import pytest
 import tiny_run
@@ -16,6 +18,8 @@ from tiny_run import Trained
 from t6gps.__main__ import use_one_thread
 from t6gps.service import threads
 from t6gps.storage import fields, schema
+from t6gps.storage.objects import place
+from t6gps.storage.objects.place import ObjectPath
 from t6gps.storage.records import Episode
 
 threads.limit()  # of the libraries that are loaded
@@ -105,6 +109,23 @@ def wait_until() -> Callable[..., None]:
 def tiny(tmp_path_factory: pytest.TempPathFactory) -> Trained:
     """A finished run; no test changes it."""
     return tiny_run.train(tmp_path_factory.mktemp("tiny"))
+
+
+@pytest.fixture(scope="session")
+def seaweed(tmp_path_factory: pytest.TempPathFactory) -> Iterator[object_stores.Store]:
+    """SeaweedFS, which a test that kills it starts again."""
+    with object_stores.seaweed(tmp_path_factory.mktemp("seaweed")) as store:
+        yield store
+
+
+@pytest.fixture
+def objects(
+    seaweed: object_stores.Store, monkeypatch: pytest.MonkeyPatch, request: pytest.FixtureRequest
+) -> ObjectPath:
+    """A root in SeaweedFS that no other test uses; the variables AWS_* lead to it meanwhile."""
+    for name, value in seaweed.environment.items():
+        monkeypatch.setenv(name, value)
+    return place.whole(Path(f"s3://{object_stores.BUCKET}/{request.node.name.partition('[')[0]}"))
 
 
 @pytest.fixture(scope="session")

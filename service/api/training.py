@@ -16,7 +16,7 @@ from pathlib import Path
 
 from t6gps.service import config as configuration
 from t6gps.service.api.run import Run
-from t6gps.service.training import session
+from t6gps.service.training import publishing, session
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
@@ -69,6 +69,7 @@ def train(
     workers: int | None = None,
     serial: bool = False,
     resume: bool = False,
+    publish: str | None = None,
     progress: Callable[[Progress], object] | None = None,
 ) -> Run:
     """Train a policy and evaluate it without noise; the finished run.
@@ -80,16 +81,18 @@ def train(
     workers    rollout workers on Ray; they change the speed, never the data
     serial     in this process, without Ray; the same data
     resume     continue the run of that name, with the same settings; start it where it is not there yet
+    publish    s3://BUCKET/PREFIX where each iteration is copied to meanwhile, in the store of the AWS_* variables
     progress   called with each `Progress`
 
     Without `serial`, workers run on the Ray that the caller is connected to, which is left running; else on the cluster
     of RAY_ADDRESS; else on one that is started for the run. ConfigError for a source or a setting that cannot be used,
-    RunError for a run that exists, or cannot be started.
+    RunError for a run that exists, or cannot be started, StoreError where a store takes no copies.
     """
     source, folder = fspath(source), Path(root)
     config = configuration.load(source, _overrides(settings, workers))
-    run = session.begin(config, folder, name, Path(source).stem, resume, _log.warning)
-    session.complete(config, run, serial, _Teller(progress))
+    copies = publishing.target(publish)
+    run = session.begin(config, folder, name, Path(source).stem, resume, _log.warning, copies)
+    session.complete(config, run, serial, _Teller(progress), copies)
     return Run(run.path)
 
 

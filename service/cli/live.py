@@ -116,6 +116,12 @@ def _print_status(run_name: str, state: Status) -> None:
         ", ".join(f"{count} {name.replace('_', ' ')}" for name, count in counts.items()),
         *waits,
     ]
+    if "published" in state:
+        copied = state["published"]
+        trouble = f"; the last attempt: {copied['error']}" if copied["error"] else ""
+        lines.append(
+            f"published to {copied['to']}: {copied['iterations']} iterations, {copied['behind']} behind{trouble}"
+        )
     if state["quarantined"]:
         lines.append(f"quarantined for their failures: episodes {', '.join(map(str, state['quarantined']))}")
     typer.echo("\n".join(lines))

@@ -26,6 +26,7 @@ from t6gps.service.cli.options import (
     Autoscale,
     Json,
     Overrides,
+    Publish,
     Root,
     RunName,
     Serial,
@@ -36,11 +37,11 @@ from t6gps.service.cli.options import (
 from t6gps.service.logs import Role, Speaker
 from t6gps.service.studies import declared
 from t6gps.service.studies.declared import Scale
-from t6gps.service.training import origin, session
+from t6gps.service.training import origin, publishing, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import T6GpsError
+from t6gps.storage.errors import ConfigError, T6GpsError
 
 app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
 
@@ -85,24 +86,28 @@ def train(
     resume: Annotated[
         bool, typer.Option("--resume", help="Continue an interrupted run; start one that is not there yet.")
     ] = False,
+    publish: Publish = None,
     overrides: Overrides = None,
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
+    if server is not None and publish is not None:
+        raise ConfigError("--publish copies runs of this machine; leave out --publish or --server")
     if server is not None:
         serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
         return
     config = configuration.load(source, with_workers(overrides, workers, autoscale))
     logs.become(Role.SUPERVISOR, run_name)
-    run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn)
+    copies = publishing.target(publish)
+    run = session.begin(config, root, run_name, Path(source).stem, resume, terminal.warn, copies)
     logs.become(Role.SUPERVISOR, run.name)
     try:
         with terminal.ProgressDisplay(config.run.iterations) as display:
-            result = session.complete(config, run, serial, display)
+            result = session.complete(config, run, serial, display, copies)
     except KeyboardInterrupt:
         if not run.path.exists():
             terminal.say("stopped before anything was sampled; nothing is left of the run")
             raise typer.Exit(EXIT_INTERRUPTED) from None
-        _exit_interrupted(_train_command(run, source, root, overrides))
+        _exit_interrupted(_train_command(run, source, root, publish, overrides))
     from t6gps.service.views import run_figures
 
     pictures = run_figures.draw(run, origin.configured(run))
@@ -216,8 +221,9 @@ def _exit_interrupted(command: list[str]) -> NoReturn:
     raise typer.Exit(EXIT_INTERRUPTED) from None
 
 
-def _train_command(run: Run, source: str, root: Path, overrides: list[str] | None) -> list[str]:
+def _train_command(run: Run, source: str, root: Path, publish: str | None, overrides: list[str] | None) -> list[str]:
     parts = ["t6gps", "train", source, "--run", run.name, "--root", str(root), "--resume"]
+    parts += [] if publish is None else ["--publish", publish]
     return parts + [f"--set={override}" for override in overrides or []]
 
 

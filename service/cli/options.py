@@ -7,13 +7,30 @@ from typing import Annotated
 
 import typer
 
+from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
+from t6gps.storage.objects import place
 
 DEFAULT_ROOT = Path("runs")
 INTERRUPTED = 130
 """The exit code of a command that Ctrl-C has ended."""
 
-Root = Annotated[Path, typer.Option("--root", envvar="T6GPS_ROOT", help="Folder that holds the runs.")]
+
+def _root(text: str | Path) -> Path:
+    path = Path(text)
+    return catalog.whole(path) if place.is_object(path) else path
+
+
+Root = Annotated[
+    Path,
+    typer.Option(
+        "--root",
+        envvar="T6GPS_ROOT",
+        metavar="FOLDER|s3://BUCKET/PREFIX",
+        parser=_root,
+        help="Folder that holds the runs, or an object store to read them from.",
+    ),
+]
 Server = Annotated[
     str | None,
     typer.Option("--server", metavar="URL", envvar="T6GPS_SERVER", help="A server (t6gps serve) in place of --root."),
@@ -23,6 +40,10 @@ JobName = Annotated[str, typer.Argument(metavar="JOB|RUN", help="Name of a job (
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[
     list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
+]
+Publish = Annotated[
+    str | None,
+    typer.Option("--publish", metavar="s3://BUCKET/PREFIX", help="Copy each iteration into an object store meanwhile."),
 ]
 Serial = Annotated[bool, typer.Option("--serial", help="Run in this process, without Ray; same data.")]
 Workers = Annotated[int | None, typer.Option("--workers", help="Rollout workers (changes the speed only).")]

@@ -16,6 +16,8 @@ from typing_extensions import TypedDict  # pydantic cannot check those of `typin
 
 from t6gps.service.pool.outside import Situation
 from t6gps.service.pool.state import RunState, Worker, WorkerPhase
+from t6gps.service.steering import published
+from t6gps.service.steering.published import Published
 from t6gps.storage import catalog, durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
@@ -52,6 +54,7 @@ class Status(TypedDict, total=False):
     backlog           episodes of the batch that are neither durable nor quarantined
     leases, arrived   of these, with a worker, and back but not durable
     episodes          counts of the whole run, by `ledger.COUNTERS`;   processes    of workers
+    published         how far it is copied into an object store, where it is
     """
 
     time_s: Required[float]
@@ -74,6 +77,7 @@ class Status(TypedDict, total=False):
     quarantined: list[int]
     episodes: dict[str, int]
     processes: dict[str, int]
+    published: Published
 
 
 _STATUS = TypeAdapter(Status)
@@ -161,6 +165,11 @@ def status(run: Run) -> Status:
 
     What a process left behind that has ended without a word is said to be STOPPED. RunError when the run has none.
     """
+    newest, copied = _newest(run), published.standing(run)
+    return newest if copied is None else {**newest, "published": copied}
+
+
+def _newest(run: Run) -> Status:
     newest = last_said(run)
     if newest is None:
         raise RunError(f"run {run.name} has no status: it was never run with workers; start it with t6gps train")

@@ -124,6 +124,7 @@ def conduct(
     by default the one that is checked out.
     """
     present = present or commit()
+    catalog.folder(root)
     runs = _begun(planned, root)
     _warn_of_other_commits(list(runs.values()), present, watcher)
     missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]

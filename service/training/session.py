@@ -17,13 +17,14 @@ from t6gps.service.execution.executor import Executor
 from t6gps.service.logs import Role
 from t6gps.service.pool.state import RunState
 from t6gps.service.steering.watch import heeding
-from t6gps.service.training import evaluation, evaluation_records, loop, origin, policies
+from t6gps.service.training import evaluation, evaluation_records, loop, origin, policies, publishing
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.evaluation_records import Occasion, Purpose
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import LearnerDiedError, RunError
+from t6gps.storage.errors import LearnerDiedError, RunError, T6GpsError
+from t6gps.storage.objects.place import ObjectPath
 from t6gps.storage.records import PolicySnapshot
 
 if TYPE_CHECKING:
@@ -82,20 +83,42 @@ def check_unchanged(run: Run, config: Config, remedy: str) -> None:
         raise RunError(f"run {run.name} has another configuration: {'; '.join(changed)}; {remedy}")
 
 
-def begin(config: Config, root: Path, name: str | None, default: str, resume: bool, warn: Warn) -> Run:
+def begin(
+    config: Config,
+    root: Path,
+    name: str | None,
+    default: str,
+    resume: bool,
+    warn: Warn,
+    copies: ObjectPath | None = None,
+) -> Run:
     """The run of that name below `root`: a new one, or with `resume` the one that there is, if there is one.
 
     Without a name it is `default`, or without `resume` the first of default-2, default-3, ... that is free. RunError
     when the name is taken or refused, when the run to resume has another configuration, or when the root takes no more
     files. `warn` is told what made the run and is another now.
+
+    copies   root in an object store where the run will be published; StoreError where that takes none, RunError where
+             it holds another run of the name
     """
-    checks.require((checks.root_folder,), Wanted(config.run.workers, root))
+    checks.require((checks.root_folder,), Wanted(config.run.workers, catalog.folder(root)))
     chosen = default if name is None else name
-    if not (resume and catalog.exists(root, chosen)):
-        return origin.create(config, root, chosen, numbered=name is None and not resume)
-    run = catalog.open_run(root, chosen)
-    tell_changes(run, warn)
-    check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
+    there = resume and catalog.exists(root, chosen)
+    if copies is not None:
+        publishing.probe(copies, there, warn)
+    if there:
+        run = catalog.open_run(root, chosen)
+        tell_changes(run, warn)
+        check_unchanged(run, config, "repeat the run's settings, or start a new run with --run")
+    else:
+        run = origin.create(config, root, chosen, numbered=name is None and not resume)
+    if copies is not None:
+        try:
+            publishing.check(run, copies)
+        except T6GpsError:
+            if not there:
+                catalog.discard_unused(run)
+            raise
     return run
 
 
@@ -106,8 +129,10 @@ def tell_changes(run: Run, warn: Warn) -> None:
         warn(sentence)
 
 
-def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Evaluation:
-    """Train what is missing of a run, evaluate its policy without noise, and keep the result.
+def complete(
+    config: Config, run: Run, serial: bool, observer: Observer, copies: ObjectPath | None = None
+) -> Evaluation:
+    """Train what is missing of a run, evaluate its policy without noise, keep the result, and publish it in `copies`.
 
     Everything sampled is kept when KeyboardInterrupt comes, also by `t6gps stop`. A run is removed whose first executor
     does not start.
@@ -121,11 +146,11 @@ def complete(config: Config, run: Run, serial: bool, observer: Observer) -> Eval
         except BaseException:
             catalog.discard_unused(run)
             raise
-        with closing(started) as executor:
+        with closing(started) as executor, publishing.beside(run, copies, observer) as watcher:
             with heeding(run):
-                result = train_and_evaluate(config, run, executor, observer)
+                result = train_and_evaluate(config, run, executor, watcher)
             executor.close(RunState.DONE)
-        evaluation.keep(run, result)
+            evaluation.keep(run, result)
         return result
 
 
@@ -187,6 +212,8 @@ def evaluate(
     RunError for a policy that the run does not keep, and before its first one.
     """
     policy = policy or policies.load(run, asked.version)
+    if asked.keep:
+        catalog.folder(run.path)
     with closing(start_executor(config, serial, engine=engine)) as executor:
         if asked.keep:
             occasion = Occasion(Purpose.EVAL, terrain_seed=asked.terrain_seed, engine=engine.value)

@@ -11,7 +11,7 @@ import pyarrow.compute as pc
 from t6gps.service.training import origin
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import T6GpsError
+from t6gps.storage.errors import StoreError, T6GpsError
 
 Row: TypeAlias = Mapping[str, int | float | None]
 
@@ -34,11 +34,13 @@ class RunSummary:
 
 
 def summary(run: Run) -> RunSummary:
-    """A run in a line; what cannot be read of it is its fault, and hides no other run."""
+    """A run in a line; what cannot be read of it is its fault, and hides no other run. StoreError as for all runs."""
     try:
         planned, done = origin.configured(run).run.iterations, tables.committed_iterations(run)
         tables.files(run)  # all are whole
         last = iterations(run, done - 1)[-1:]
+    except StoreError:
+        raise
     except T6GpsError as error:
         return RunSummary(name=run.name, fault=str(error))
     row: Row = last[0] if last else {}

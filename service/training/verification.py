@@ -12,12 +12,19 @@ from t6gps.storage.care import verify as care
 from t6gps.storage.care.fault import Fault, Progress
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, T6GpsError
+from t6gps.storage.objects import place
 
 
 def verify(run: Run, progress: Progress = lambda done, total: None) -> list[Fault]:
-    """Everything that is wrong with a run, which may be at work meanwhile. Nothing is written."""
+    """Everything that is wrong with a run, which may be at work meanwhile. Nothing is written.
+
+    StoreError where it lies in an object store that does not answer.
+    """
     own = [*_settings(run), *_evaluations(run)]  # the file is written after the row that it is held against
-    return own + care.verify(run, progress)
+    faults = own + care.verify(run, progress)
+    if faults:
+        place.answers(run.path)  # a store that has gone away is no fault of the run
+    return faults
 
 
 def _settings(run: Run) -> Iterator[Fault]:

@@ -22,6 +22,7 @@ from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet, policies
 from t6gps.storage.errors import DataError
+from t6gps.storage.objects import place
 
 KEYS = {
     "frames": ("iteration", "episode_id", "step", "policy_version"),
@@ -133,10 +134,14 @@ def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, s
 
 
 def examine(run: Run, found: Found, entry: Entry) -> None:
-    """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong."""
+    """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong.
+
+    StoreError where its object store does not answer.
+    """
     try:
         keys = _keys(found.table, entry)
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
+        place.answers(entry.path)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
         found.faults.append(Fault(found.table, within(run, entry.path), what, entry.number))
     else:
@@ -145,14 +150,15 @@ def examine(run: Run, found: Found, entry: Entry) -> None:
 
 def _keys(table: str, entry: Entry) -> pa.Table:
     """The keys of a file that is as it was written, else some error."""
-    if not entry.path.is_file():
-        raise ValueError("it is missing")
-    size = entry.path.stat().st_size
+    try:
+        size = entry.path.stat().st_size
+    except FileNotFoundError:
+        raise ValueError("it is missing") from None
     if size != entry.size:
         raise ValueError(f"its log has {entry.size} bytes, found {size}")
     if entry.sha256 not in (None, durable.sha256(entry.path)):
         raise ValueError("it was altered: it fails the SHA-256 in its log")
-    with pq.ParquetFile(entry.path, page_checksum_verification=True) as file:
+    with pq.ParquetFile(place.source(entry.path), page_checksum_verification=True) as file:
         wrong = _schema_wrong(table, file.schema_arrow)
         if wrong is not None:
             raise ValueError(wrong)

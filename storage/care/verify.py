@@ -18,6 +18,7 @@ from t6gps.storage.care.delta_files import Found
 from t6gps.storage.care.fault import Fault, Progress, within
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import CheckpointError, DataError
+from t6gps.storage.objects import place
 
 FIRST, LAST = ("episodes", "evaluations"), ("iterations",)
 """Tables that are committed last, and opened first; and the one that others refer to, which is opened last."""
@@ -87,7 +88,8 @@ def _checkpoints(run: Run, states: dict[int, Path], iterations_n: int) -> Iterat
         try:
             manifest = checkpoint.load(path)[1]
         except CheckpointError as error:
-            if path.exists():
+            # In an object store it appears file by file, DONE last.
+            if (path / "DONE").exists() if place.is_object(path) else path.exists():
                 yield Fault("checkpoints", within(run, path), str(error), repairable=True)
         else:
             # Baselines keep a state of their policy, and have no iterations.

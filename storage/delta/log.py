@@ -18,6 +18,7 @@ from t6gps.storage import durable, schema
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import parquet
 from t6gps.storage.errors import DataError
+from t6gps.storage.objects import place, store
 
 MESSAGE_LENGTH_N = 300
 """Characters of a library's message that are repeated; it may add where in its own code it stopped."""
@@ -35,8 +36,10 @@ _APPLICATION = "t6gps"
 def opened(run: Run, table: str) -> DeltaTable | None:
     """A table by its log, None before the first commit. DataError where the log is damaged."""
     location = str(run.tables / table)
+    options = store.delta_options() if place.is_object(run.path) else None
     with readable(run, table):
-        return DeltaTable(location) if DeltaTable.is_deltatable(location) else None
+        there = DeltaTable.is_deltatable(location, storage_options=options)
+        return DeltaTable(location, storage_options=options) if there else None
 
 
 def committed(delta: DeltaTable | None) -> int:
@@ -49,12 +52,12 @@ def files(run: Run, table: str, delta: DeltaTable) -> list[str]:
     """The table's files by name. DataError where one is missing or has another size than its commit says."""
     with readable(run, table):
         actions = pa.table(delta.get_add_actions(flatten=True)).select(["path", "size_bytes"]).sort_by("path")
-        sizes = {run.tables / table / row["path"]: row["size_bytes"] for row in actions.to_pylist()}
+        sizes = {row["path"]: row["size_bytes"] for row in actions.to_pylist()}
+        there = place.sizes(run.tables / table)
         for file, size in sizes.items():
-            if not file.is_file() or file.stat().st_size != size:
-                found = f"{file.stat().st_size}" if file.is_file() else "none"
-                raise damaged(run, table, f"{file.name} has {size} bytes, found {found}")
-    return [str(file) for file in sizes]
+            if there.get(file) != size:
+                raise damaged(run, table, f"{file} has {size} bytes, found {there.get(file, 'none')}")
+    return [str(run.tables / table / file) for file in sizes]
 
 
 def add(run: Run, table: str, number: int, stem: str, groups: Iterable[pa.Table]) -> None:
@@ -109,10 +112,11 @@ def _commit(run: Run, table: str, file: Path, number: int, statistics: _Statisti
 
 @contextmanager
 def readable(run: Run, table: str) -> Iterator[None]:
-    """What libraries say of a table that they cannot read becomes a DataError."""
+    """What libraries say of a table that they cannot read becomes a DataError; a StoreError where its store is away."""
     try:
         yield
     except (DeltaError, pa.ArrowException, OSError) as error:
+        place.answers(run.path)
         lines = str(error).splitlines() or [type(error).__name__]
         raise damaged(run, table, lines[0][:MESSAGE_LENGTH_N]) from error
 

@@ -9,10 +9,10 @@ from pathlib import Path
 import pyarrow as pa
 import pyarrow.compute as pc
 import pyarrow.dataset as ds
-import pyarrow.fs
 import pyarrow.parquet as pq
 
 from t6gps.storage import durable, schema
+from t6gps.storage.objects import place
 
 _VERIFIED = ds.ParquetFileFormat(
     default_fragment_scan_options=ds.ParquetFragmentScanOptions(page_checksum_verification=True)
@@ -57,7 +57,7 @@ def write(file: Path, definition: pa.Schema, groups: Iterable[pa.Table]) -> None
 
 def groups(file: Path, columns: list[str]) -> Iterator[pa.Table]:
     """Columns of a file's row groups, one after the other. ArrowException or OSError where the file is torn."""
-    with pq.ParquetFile(file, page_checksum_verification=True) as found:
+    with pq.ParquetFile(place.source(file), page_checksum_verification=True) as found:
         for number in range(found.num_row_groups):
             yield found.read_row_group(number, columns)
 
@@ -83,22 +83,24 @@ def rows(table: str, files: Files) -> ds.Dataset:
     definition = schema.TABLES[table]
     if not files.paths:
         return ds.dataset(definition.empty_table())
-    found = ds.dataset(files.paths, definition, format=_VERIFIED)
+    file_system, paths = place.located(files.paths)
+    found = ds.dataset(paths, definition, format=_VERIFIED, filesystem=file_system)
     return found if files.iterations_n is None else found.filter(_seen(definition, files.iterations_n))
 
 
 def rows_of_runs(table: str, files: Mapping[str, Files]) -> ds.Dataset:
     """The rows of files of many runs, by the runs' names, lazily, with the column `run` before the others."""
     definition = pa.schema([schema.RUN, *schema.TABLES[table]])
-    paths = [(path, pc.field("run") == run) for run, found in files.items() for path in found.paths]
-    if not paths:
+    of_runs = [pc.field("run") == run for run, found in files.items() for _ in found.paths]
+    if not of_runs:
         return ds.dataset(definition.empty_table())
+    file_system, paths = place.located(path for found in files.values() for path in found.paths)
     rows = ds.FileSystemDataset.from_paths(
-        [path for path, _ in paths],
+        paths,
         schema=definition,
         format=_VERIFIED,
-        filesystem=pyarrow.fs.LocalFileSystem(),
-        partitions=[of_run for _, of_run in paths],
+        filesystem=file_system,
+        partitions=of_runs,
     )
     for run, found in files.items():
         if found.iterations_n is not None:
@@ -113,7 +115,8 @@ def _seen(definition: pa.Schema, iterations_n: int) -> pc.Expression:
 
 def version(file: str) -> int:
     """The schema version of a file's rows, 0 where another program wrote it. OSError or ArrowException without one."""
-    found = pq.read_schema(file).metadata or {}
+    file_system, (path,) = place.located([file])
+    found = pq.read_schema(path, filesystem=file_system).metadata or {}
     return int(found.get(b"t6gps_schema_version", b"0"))
 
 

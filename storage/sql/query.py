@@ -25,7 +25,7 @@ from t6gps.storage import schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
-from t6gps.storage.errors import DataError, QueryError, T6GpsError
+from t6gps.storage.errors import DataError, QueryError, StoreError, T6GpsError
 from t6gps.storage.sql import sandbox, views
 
 RunFiles: TypeAlias = dict[str, Files]
@@ -152,7 +152,7 @@ def _read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
             found = tables.files(run, of_files) if of_files else {}
             row = question.about.row(run) if "runs" in named else None
         except T6GpsError as error:
-            if question.left_out is None:
+            if question.left_out is None or isinstance(error, StoreError):
                 raise
             question.left_out(str(error))
             continue

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pyarrow as pa
 
-from t6gps.storage import fields, schema
+from t6gps.service.config import load
+from t6gps.service.training import origin
+from t6gps.storage import checkpoint, fields, schema
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import iterations
 from t6gps.storage.records import Episode, Learned, PolicySnapshot
@@ -31,6 +34,15 @@ def commit(run: Run, iteration: int) -> None:
     policies = [PolicySnapshot(version, (layer,), 0.9, 0.2) for version in versions]
     learned = Learned(row, [], schema.MODELS.empty_table(), policies)
     iterations.commit(run, iteration, iter(episodes(iteration)), learned)
+
+
+def made(root: Path, iterations_n: int, name: str = "rolling") -> Run:
+    """A sound run of so many iterations, with their checkpoints."""
+    run = origin.create(load("flat-quick"), root, name)
+    for iteration in range(iterations_n):
+        commit(run, iteration)
+        checkpoint.save(run.checkpoints, iteration + 1, {"ledger": {}}, {"weights": np.arange(100.0) + iteration})
+    return run
 
 
 def _episode(episode_id: int, iteration: int, index: int) -> Episode:

@@ -11,7 +11,7 @@ from typing import Annotated
 import typer
 
 from t6gps.service.cli.options import DEFAULT_ROOT, Json, Root, RunName
-from t6gps.service.training import verification
+from t6gps.service.training import copying, verification
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.care import repair as repairing
@@ -20,6 +20,14 @@ from t6gps.storage.errors import RunError
 EXIT_DAMAGED = 2
 NewName = Annotated[str, typer.Argument(metavar="NEW", help="Name that it gets.")]
 To = Annotated[Path | None, typer.Option("--to", help="Folder of runs that it goes to; by default the same.")]
+CopyTo = Annotated[
+    Path | None,
+    typer.Option(
+        "--to",
+        metavar="FOLDER|s3://BUCKET/PREFIX",
+        help="Folder or object store that it goes to; by default the same.",
+    ),
+]
 
 
 def add_to(app: typer.Typer) -> None:
@@ -71,10 +79,10 @@ def repair(
         raise RunError(f"run {run.name} is still damaged; repair it --from a sound copy")
 
 
-def copy(run_name: RunName, new: NewName, to: To = None, root: Root = DEFAULT_ROOT) -> None:
-    """Copy a run that nobody uses, whole or not at all."""
-    with terminal.task(f"copying {run_name}"):
-        typer.echo(catalog.copy(catalog.open_run(root, run_name), to or root, new).path)
+def copy(run_name: RunName, new: NewName, to: CopyTo = None, root: Root = DEFAULT_ROOT) -> None:
+    """Copy a run that nobody uses, whole or not at all; into an object store, or from there."""
+    with terminal.task(f"copying {run_name}") as progress:
+        typer.echo(copying.copy(catalog.open_run(root, run_name), to or root, new, progress).path)
 
 
 def move(run_name: RunName, new: NewName, to: To = None, root: Root = DEFAULT_ROOT) -> None:

@@ -1,0 +1,242 @@
+"""Copying a run into an object store, so that its readers see whole iterations at any moment.
+
+Objects appear one after the other, and each whole. So data go first and the entry of the log that names them after,
+`episodes` and `evaluations` last of the tables, a checkpoint's DONE last of its files. Objects that never change are
+created only where there is none; one that is there already must be the same, or it belongs to another run.
+
+What is left to copy follows from both logs. A copy that was cut off is continued by copying again.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import mmap
+import secrets
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass
+from pathlib import Path, PurePosixPath
+from typing import Literal
+
+from t6gps.storage import checkpoint, durable, schema
+from t6gps.storage.errors import RunError, StoreError
+from t6gps.storage.objects import store
+from t6gps.storage.objects.place import ObjectPath, answers, below
+
+FIXED = ("config.json", "origin.json", "ground")
+"""What a run is created with; it says whose an object is."""
+OF_THE_PROCESS = ("request.json", "pool/published.json")
+"""What is never copied: it is for the process that runs the run."""
+AT_WORK = ("spool", "pool", "figures", "damaged")
+"""What changes while a run is at work, or can be made again."""
+LAST = ("episodes", "evaluations")
+"""Tables whose readers expect all others."""
+Progress = Callable[[int, int], object]
+
+
+@dataclass(frozen=True)
+class _Step:
+    """A file that is to be copied. `created` ones never change; the others take the place of what is there."""
+
+    file: str
+    created: bool = True
+
+
+@dataclass(frozen=True, order=True)
+class _Commit:
+    """A commit to a table, in the order in which commits are copied: one iteration after the other.
+
+    number   of its iteration or evaluation; -1 for the commit that makes the table
+    files    what it adds, then its own entry of the log
+    """
+
+    of_evaluations: bool
+    number: int
+    last: bool
+    files: tuple[str, ...]
+
+
+def probe(root: ObjectPath) -> None:
+    """See that objects can be made below a root, and that none replaces another unasked. StoreError where they can.
+
+    Without that, two writers may both believe that their entry of a log is the one that is kept.
+    """
+    import obstore
+
+    answers(root)  # some stores make a bucket that is written to
+    trial = root / f".probe-{secrets.token_hex(8)}"
+    _put(trial, b"1", created=True)
+    try:
+        _put(trial, b"2", created=True)
+    except FileExistsError:
+        return
+    finally:
+        with store.asking(root.bucket, str(trial)):
+            obstore.delete(root.client(), trial.key)
+    raise StoreError(
+        f"{store.access().name} ignores If-None-Match: it let one object replace another that was to be kept, so "
+        "commits could be lost; publish to a store that refuses it, such as Amazon S3, SeaweedFS or MinIO"
+    )
+
+
+def check_same(run: Path, target: ObjectPath) -> None:
+    """RunError where the place of a run holds another run, or one that has gone further."""
+    _check_same(run, target, target.below())
+
+
+def publish(
+    run: Path, target: ObjectPath, without: tuple[str, ...] = (), progress: Progress = lambda done, total: None
+) -> None:
+    """Copy what is left to copy of the run in a folder, which may be at work.
+
+    without    files and folders of it that are not copied
+    progress   is told the files that are copied, and all that are
+
+    RunError where another run is there, StoreError where the store refuses or is away.
+    """
+    there = target.below()
+    _check_same(run, target, there)
+    steps = _steps(run, there, (*OF_THE_PROCESS, *without))
+    for done, step in enumerate(steps):
+        progress(done, len(steps))
+        _copy(run, target, step, there)
+    progress(len(steps), len(steps))
+    _forget_states(run, target, there)
+
+
+def fetch(source: ObjectPath, folder: Path, progress: Progress) -> None:
+    """Copy a run from a store into a folder that is empty. StoreError, or FileNotFoundError for an object that goes."""
+    import obstore
+
+    files = source.below()
+    for done, file in enumerate(files):
+        progress(done, len(files))
+        copy, place = folder / file, source / file
+        copy.parent.mkdir(parents=True, exist_ok=True)
+        with copy.open("wb") as opened, store.asking(source.bucket, str(place)):
+            opened.writelines(obstore.get(source.client(store.WRITE_S), place.key).stream())
+    progress(len(files), len(files))
+
+
+def iterations(run: Path) -> int:
+    """How many iterations a run has by the log of `episodes`, here or in a store."""
+    commits = len(list((run / "tables" / "episodes" / "_delta_log").glob("*.json")))
+    return max(0, commits - 1)  # the first makes the table
+
+
+def _check_same(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
+    another = RunError(f"{target} holds another run of that name; choose another name or prefix")
+    fixed = [file for file in there if file.startswith(FIXED)]
+    entries = sorted(file for file in there if "/_delta_log/" in file)
+    newest = {PurePosixPath(file).parent: file for file in entries}.values()
+    here = below(run)
+    if any(here.get(file) != there[file] or not _same(run, target, file) for file in fixed):
+        raise another
+    more = [file for file in entries if file not in here]
+    if more:
+        raise RunError(f"{target} has more of the run than {run}: {more[0]}; copy it from there, and go on with it")
+    if any(here[file] != there[file] for file in entries) or not all(_same(run, target, file) for file in newest):
+        raise another
+
+
+def _same(run: Path, target: ObjectPath, file: str) -> bool:
+    return (run / file).read_bytes() == (target / file).read_bytes()
+
+
+def _steps(run: Path, there: Mapping[str, int], without: tuple[str, ...]) -> list[_Step]:
+    """What is left to copy, in order.
+
+    What is written later is looked at earlier: a checkpoint and an evaluation's file before the tables that they
+    follow, `episodes` before the tables that it follows. So nothing is copied without what it refers to.
+    """
+    states = [f"checkpoints/{path.name}" for path in checkpoint.kept(run / "checkpoints").values()]
+    others = [_Step(file, created=False) for file in _others(run, without)]
+    looked = [_commits(run, table, there) for table in sorted(schema.TABLES, key=lambda table: table not in LAST)]
+    commits = sorted(commit for commits in looked for commit in commits)
+    steps = [_Step(file) for file in _files(run) if file.startswith(FIXED) and file not in there]
+    steps += [_Step(file) for commit in commits for file in commit.files]
+    steps += others
+    for state in (state for state in states if f"{state}/DONE" not in there):
+        files = (_Step(f"{state}/{name}", created=False) for name in ("arrays.npz", "manifest.json"))
+        steps += [*files, _Step(f"{state}/DONE")]
+    return steps
+
+
+def _commits(run: Path, table: str, there: Mapping[str, int]) -> list[_Commit]:
+    """The commits to a table that are not there."""
+    entries = sorted((run / "tables" / table / "_delta_log").glob("*.json"))
+    left = {entry.relative_to(run).as_posix(): entry for entry in entries}
+    return [_commit(table, file, entry) for file, entry in left.items() if file not in there]
+
+
+def _commit(table: str, file: str, entry: Path) -> _Commit:
+    actions = [json.loads(line) for line in entry.read_text(encoding="utf-8").splitlines()]
+    number = next((action["txn"]["version"] for action in actions if "txn" in action), -1)
+    data = (f"tables/{table}/{action['add']['path']}" for action in actions if "add" in action)
+    return _Commit(table in schema.OF_EVALUATIONS, number, table in LAST, (*data, file))
+
+
+def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:
+    apart = (*FIXED, "tables", "checkpoints", *without)
+    for file in _files(run):
+        if not any(file == each or file.startswith(f"{each}/") for each in apart):
+            yield file
+
+
+def _files(run: Path) -> list[str]:
+    """Files by their paths in the run, without hidden ones: locks, and what is not finished."""
+    places = (path.relative_to(run) for path in sorted(run.rglob("*")) if path.is_file())
+    return [place.as_posix() for place in places if not any(part.startswith(".") for part in place.parts)]
+
+
+def _copy(run: Path, target: ObjectPath, step: _Step, there: Mapping[str, int]) -> None:
+    """Copy a file. RunError where another one is there that was to be kept."""
+    source, copy = run / step.file, target / step.file
+    try:
+        content = _content(source)
+    except FileNotFoundError:
+        if step.file.startswith("tables/"):
+            raise
+        return  # the run has replaced it meanwhile, and says so by another
+    if not step.created and there.get(step.file) == len(content) and durable.sha256(copy) == _sha256(content):
+        return
+    try:
+        _put(copy, content, step.created)
+    except FileExistsError:
+        if durable.sha256(copy) != _sha256(content):
+            raise RunError(
+                f"{copy} is of another run, or of this one as it went on elsewhere; choose another name or prefix"
+            ) from None
+
+
+def _put(copy: ObjectPath, content: bytes | mmap.mmap, created: bool) -> None:
+    """Make an object; FileExistsError where one is to be created and there is one."""
+    import obstore
+
+    mode: Literal["create", "overwrite"] = "create" if created else "overwrite"
+    with store.asking(copy.bucket, str(copy)):
+        obstore.put(copy.client(store.WRITE_S), copy.key, content, mode=mode, use_multipart=False)
+
+
+def _content(file: Path) -> bytes | mmap.mmap:
+    """The content of a file, of which no more is in memory than is being sent."""
+    with file.open("rb") as opened:
+        if not file.stat().st_size:
+            return b""
+        return mmap.mmap(opened.fileno(), 0, access=mmap.ACCESS_READ)
+
+
+def _sha256(content: bytes | mmap.mmap) -> str:
+    return hashlib.sha256(content).hexdigest()
+
+
+def _forget_states(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
+    """Remove the checkpoints that the run itself has removed by now, their DONE first."""
+    import obstore
+
+    kept = checkpoint.kept(run / "checkpoints")
+    first = f"checkpoints/{kept[min(kept)].name}/" if kept else ""
+    old = sorted(file for file in there if file.startswith("checkpoints/") and file < first)
+    with store.asking(target.bucket, str(target)):
+        for file in old:
+            obstore.delete(target.client(), (target / file).key)

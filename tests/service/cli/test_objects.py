@@ -1,0 +1,72 @@
+"""Laws of commands on an object store: those that read answer as on a folder, those that write refuse."""
+
+from pathlib import Path
+
+import pytest
+import synthetic
+from command import t6gps
+
+from t6gps.service.studies import origin as studies
+from t6gps.storage.objects import publishing
+from t6gps.storage.objects.place import ObjectPath
+
+ARMS = {"study-a-0": ("a", 0), "study-a-1": ("a", 1), "study-b-0": ("b", 0)}
+
+
+@pytest.fixture(scope="module")
+def study(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """The root of a study's runs, which no test changes."""
+    root = tmp_path_factory.mktemp("study")
+    for number, (name, (arm, seed)) in enumerate(ARMS.items(), 1):
+        run = synthetic.made(root, number, name)
+        with studies.recorded(run, "study", arm, seed, "0" * 7):
+            pass
+    return root
+
+
+def test_a_published_study_is_asked_as_one_in_a_folder(study: Path, objects: ObjectPath) -> None:
+    for name in ARMS:
+        t6gps("cp", name, name, "--root", study, "--to", objects)
+    sql = "SELECT arm, count(DISTINCT run) AS runs, max(cost) AS cost FROM learning_curves GROUP BY arm ORDER BY arm"
+    frames = "SELECT run, iteration, max(speed_m_per_s) AS most FROM frames GROUP BY ALL ORDER BY ALL"
+    for asked in (
+        ("runs",),
+        ("verify", "study-a-0", "study-b-0"),
+        ("query", "study-*", sql, "--format", "csv"),
+        ("query", "study-*", frames, "--format", "csv"),
+        ("query", "study-b-0", "SELECT * FROM policies", "--format", "json"),
+        ("show", "study-b-0"),
+    ):
+        here, there = (t6gps(*asked, "--root", root).stdout.decode().splitlines() for root in (study, objects))
+        rows = asked[0] in ("runs", "show")  # beside the name of the root
+        assert [line for line in there if not rows or line[0:1] == "│"] == [
+            line for line in here if not rows or line[0:1] == "│"
+        ]
+    assert "a,2," in t6gps("query", "study-*", sql, "--format", "csv", "--root", objects).stdout.decode().replace(
+        '"', ""
+    )
+
+
+WRITING = {
+    "train": ("train", "flat-quick", "--serial"),
+    "study": ("study", "horizon"),
+    "eval": ("eval", "rolling", "--serial"),
+    "repair": ("repair", "rolling"),
+    "mv": ("mv", "rolling", "other"),
+    "rm": ("rm", "rolling", "--yes"),
+    "submit": ("submit", "flat-quick"),
+    "serve": ("serve", "--port", "0"),
+    "cp": ("cp", "rolling", "other"),
+}
+
+
+def test_commands_that_write_refuse_an_object_store(tmp_path: Path, objects: ObjectPath) -> None:
+    run = synthetic.made(tmp_path, 1)
+    publishing.publish(run.path, objects / run.name)
+    before = objects.below()
+    for command in WRITING.values():
+        refused = t6gps(*command, "--root", objects, code=2)
+        errors = [line for line in refused.stderr.splitlines() if not line.startswith("warning:")]
+        assert len(errors) == 1, errors
+        assert "in an object store" in errors[0]
+    assert objects.below() == before

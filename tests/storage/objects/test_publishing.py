@@ -1,0 +1,158 @@
+"""Laws of copying runs into an object store: whole at any moment, never over another, never where commits are lost."""
+
+import shutil
+from pathlib import Path
+
+import numpy as np
+import object_stores
+import obstore
+import pytest
+import synthetic
+from run_digest import digests
+
+from t6gps.service.training import copying, verification
+from t6gps.storage import catalog, checkpoint, tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import DataError, RunError, StoreError, StoreUnreachableError
+from t6gps.storage.objects import place, publishing
+from t6gps.storage.objects.place import ObjectPath
+
+
+def quiet(done: int, total: int) -> None:
+    assert done <= total
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> Run:
+    """A run of two iterations that no test changes."""
+    return synthetic.made(tmp_path_factory.mktemp("here"), 2)
+
+
+def test_a_run_comes_back_from_a_store_with_the_same_bytes(run: Run, objects: ObjectPath, tmp_path: Path) -> None:
+    there = copying.copy(run, objects, "far", quiet)
+    assert verification.verify(there) == []
+    back = copying.copy(there, tmp_path, "back", quiet)
+    assert digests(back.path) == digests(run.path)
+    assert place.below(back.path / "tables") == place.below(run.path / "tables")
+
+
+def test_readers_see_a_sound_run_at_any_moment_of_its_copying(run: Run, objects: ObjectPath) -> None:
+    seen, there = list[int](), Run(objects / run.name)
+
+    def look(done: int, total: int) -> None:
+        if done % 3 == 1 or done == total:
+            assert verification.verify(there) == []
+            seen.append(tables.committed_iterations(there))
+
+    publishing.publish(run.path, objects / run.name, progress=look)
+    assert seen == sorted(seen)
+    assert {0, 1, 2} == set(seen)
+
+
+class CutOff(Exception):
+    """Stands for the end of a process."""
+
+
+@pytest.mark.parametrize("after_n", [1, 5, 13])
+def test_a_copy_that_was_cut_off_is_continued(run: Run, objects: ObjectPath, after_n: int) -> None:
+    name = f"cut-{after_n}"
+
+    def cut(done: int, total: int) -> None:
+        if done == after_n:
+            raise CutOff
+
+    with pytest.raises(CutOff):
+        publishing.publish(run.path, objects / name, progress=cut)
+    copying.copy(run, objects, name, quiet)
+    assert digests(objects / name) == digests(run.path)
+
+
+def test_checkpoints_that_the_run_has_removed_go(objects: ObjectPath, tmp_path: Path) -> None:
+    run = synthetic.made(tmp_path, 2)
+    for iteration in (1, 4):
+        publishing.publish(run.path, objects / run.name)
+        checkpoint.save(run.checkpoints, iteration + 2, {}, {"weights": np.ones(iteration)})
+        checkpoint.save(run.checkpoints, iteration + 3, {}, {"weights": np.ones(iteration)})
+    publishing.publish(run.path, objects / run.name)
+    copies = objects / run.name / "checkpoints"
+    assert copies.below() == place.below(run.checkpoints)
+    assert checkpoint.load(copies / "iteration-000007")[0] == 7
+
+
+def test_what_is_there_is_not_sent_again(run: Run, objects: ObjectPath) -> None:
+    counts = []
+    for _ in range(2):
+        publishing.publish(run.path, objects / run.name, progress=lambda done, total: counts.append(total))
+    assert counts[0] > 20
+    assert counts[-1] == 0
+
+
+def test_another_run_of_the_name_is_left_as_it_is(run: Run, objects: ObjectPath, tmp_path: Path) -> None:
+    copying.copy(run, objects, "taken", quiet)
+    before = digests(objects / "taken")
+    other = synthetic.made(tmp_path, 1)
+    with pytest.raises(RunError, match="holds another run of that name; choose another name or prefix"):
+        copying.copy(other, objects, "taken", quiet)
+    with pytest.raises(RunError, match="another run"):
+        publishing.check_same(other.path, objects / "taken")
+    assert digests(objects / "taken") == before
+
+
+def test_a_run_that_went_on_elsewhere_is_refused(objects: ObjectPath, tmp_path: Path) -> None:
+    first = synthetic.made(tmp_path, 1)
+    second = catalog.copy(first, tmp_path, "second")
+    synthetic.commit(first, 1)
+    copying.copy(first, objects, "both", quiet)
+    with pytest.raises(RunError, match="has more of the run than"):
+        copying.copy(second, objects, "both", quiet)
+    synthetic.commit(second, 1)  # at another time, which its log says
+    with pytest.raises(RunError, match="another run"):
+        copying.copy(second, objects, "both", quiet)
+    assert verification.verify(Run(objects / "both")) == []
+
+
+def test_a_file_that_another_writer_left_without_its_log_entry_is_not_taken_for_ours(
+    run: Run, objects: ObjectPath
+) -> None:
+    file = "tables/iterations/iteration-000001.parquet"
+    copy, content = objects / "mixed" / file, (run.path / file).read_bytes()
+    obstore.put(copy.client(), copy.key, bytes(len(content)))
+    with pytest.raises(RunError, match=r"iteration-000001.parquet is of another run"):
+        publishing.publish(run.path, objects / "mixed")
+
+
+def test_a_store_that_ignores_if_none_match_is_refused(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with object_stores.rclone(tmp_path) as store:
+        for name, value in store.environment.items():
+            monkeypatch.setenv(name, value)
+        root = place.whole(Path(f"s3://{object_stores.BUCKET}/runs"))
+        with pytest.raises(StoreError, match=r"ignores If-None-Match.*publish to a store that refuses it"):
+            copying.copy(run, root, "rolling", quiet)
+        assert root.parent.below() == {".ready": 0}, "nothing was left there"
+
+
+def test_a_run_that_does_not_come_whole_is_not_kept(run: Run, objects: ObjectPath, tmp_path: Path) -> None:
+    there = copying.copy(run, objects, "torn", quiet)
+    obstore.delete(objects.client(), (objects / "torn/tables/frames/iteration-000001.parquet").key)
+    with pytest.raises(RunError, match=r"does not come whole from s3://.*frames/iteration-000001.parquet"):
+        copying.copy(there, tmp_path, "torn", quiet)
+    assert not list(tmp_path.iterdir())
+    with pytest.raises(DataError, match=r"table frames in s3://.* iteration-000001.parquet"):
+        tables.read(there, "frames")
+
+
+def test_a_store_that_goes_away_is_no_damage_of_the_run(
+    run: Run, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    shutil.copytree(run.path, tmp_path / "rolling")
+    with object_stores.seaweed(tmp_path) as store:
+        for name, value in store.environment.items():
+            monkeypatch.setenv(name, value)
+        there = copying.copy(run, place.whole(Path(f"s3://{object_stores.BUCKET}")), "rolling", quiet)
+        assert tables.read(there, "frames").num_rows > 0
+        store.kill()
+        for ask in (lambda: tables.read(there, "frames"), lambda: verification.verify(there)):
+            with pytest.raises(StoreUnreachableError, match=r"does not answer.*see AWS_ENDPOINT_URL and the network"):
+                ask()
