@@ -10,6 +10,7 @@ ROOT/NAME/figures/        pictures drawn from the tables
 ROOT/NAME/request.json    what somebody asks of the process that runs it
 ROOT/NAME/pool/           status, events and decisions of a running run
 ROOT/NAME/bundles/        episodes that failed, with what is needed to run them alone
+ROOT/.cache/NAME/         what queries over many runs keep of it; may be deleted at any time
 """
 
 from __future__ import annotations
@@ -85,6 +86,10 @@ class Run:
     @property
     def ground(self) -> Path:
         return self.path / "ground"
+
+    @property
+    def cache(self) -> Path:
+        return self.path.parent / ".cache" / self.name
 
     @property
     def config_path(self) -> Path:
@@ -169,6 +174,7 @@ def move(run: Run, root: Path, name: str) -> Run:
             root.mkdir(parents=True, exist_ok=True)
             if durable.claim(run.path, root / check_name(name)):
                 durable.sync(run.path.parent)
+                _uncache(run)
                 return Run(root / name)
         except OSError as error:
             if error.errno != errno.EXDEV:
@@ -184,6 +190,12 @@ def remove(run: Run) -> None:
     """Remove a run that nobody uses; nobody ever sees half of it. Raises RunError where it is in use."""
     with locked(run), unevaluated(run):
         durable.discard(run.path)
+        _uncache(run)
+
+
+def _uncache(run: Run) -> None:
+    """Remove what the cache has of a run that has gone. What is left would be of no use, and do no harm."""
+    shutil.rmtree(run.cache, ignore_errors=True)
 
 
 def size(run: Run) -> int:

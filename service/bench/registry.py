@@ -20,13 +20,14 @@ BENCHMARKS = {
     "scale": "t6gps.service.bench.scale",
     "server": "t6gps.service.bench.server",
     "soundness": "t6gps.workers.bench.soundness",
+    "storage": "t6gps.service.bench.stores.storage",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
-SIZED = ("pool", "server")
-"""Benchmarks that can be told how long and how often to measure."""
-LONG = ("learner", "pool", "scale", "server")
+SIZES = {"pool": ("seconds", "rounds"), "server": ("seconds", "rounds"), "storage": ("rounds",)}
+"""Benchmarks that can be told how long or how often to measure."""
+LONG = ("learner", "pool", "scale", "server", "storage")
 """Benchmarks that say how far they are."""
 
 
@@ -55,8 +56,10 @@ def measure(name: str, say: Say, **sizes: float) -> Measurement:
         close = difflib.get_close_matches(name, BENCHMARKS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
-    if sizes and name not in SIZED:
-        raise ConfigError(f"bench {name} has no --{' and no --'.join(sizes)}; allowed for: {', '.join(SIZED)}")
+    unknown = [size for size in sizes if size not in SIZES.get(name, ())]
+    if unknown:
+        has = [other for other, known in SIZES.items() if unknown[0] in known]
+        raise ConfigError(f"bench {name} has no --{' and no --'.join(unknown)}; allowed for: {', '.join(has)}")
     module = importlib.import_module(BENCHMARKS[name])
     run: Callable[..., dict[str, float | None]] = getattr(module, name)
     if name in LONG:

@@ -190,7 +190,7 @@ def bench(
         float | None, typer.Option(help="pool, server: seconds of each measurement; 30 by default.")
     ] = None,
     rounds: Annotated[
-        int | None, typer.Option(help="pool, server: measurements of each contender; 5 by default.")
+        int | None, typer.Option(help="pool, server, storage: measurements of each contender; 5 by default.")
     ] = None,
     as_json: Json = False,
 ) -> None:

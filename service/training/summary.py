@@ -12,6 +12,7 @@ from t6gps.service.training import origin
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import StoreError, T6GpsError
+from t6gps.storage.sql import cache
 
 Row: TypeAlias = Mapping[str, int | float | None]
 
@@ -36,16 +37,18 @@ class RunSummary:
 def summary(run: Run) -> RunSummary:
     """A run in a line; what cannot be read of it is its fault, and hides no other run. StoreError as for all runs."""
     try:
-        planned, done = origin.configured(run).run.iterations, tables.committed_iterations(run)
-        tables.files(run)  # all are whole
-        last = iterations(run, done - 1)[-1:]
+        planned, found = origin.configured(run).run.iterations, cache.whole(run)
     except StoreError:
         raise
     except T6GpsError as error:
         return RunSummary(name=run.name, fault=str(error))
-    row: Row = last[0] if last else {}
-    cost, speed = row.get("cost"), row.get("forward_speed_m_per_s")
-    return RunSummary(name=run.name, planned=planned, done=done, cost=cost, forward_speed_m_per_s=speed)
+    return RunSummary(
+        name=run.name,
+        planned=planned,
+        done=found.done,
+        cost=found.newest.get("cost"),
+        forward_speed_m_per_s=found.newest.get("forward_speed_m_per_s"),
+    )
 
 
 def iterations(run: Run, first: int = 0) -> list[Row]:

@@ -26,7 +26,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import DataError, QueryError, StoreError, T6GpsError
-from t6gps.storage.sql import sandbox, views
+from t6gps.storage.sql import cache, sandbox, views
 
 RunFiles: TypeAlias = dict[str, Files]
 """The files of a table by the names of runs."""
@@ -117,21 +117,11 @@ def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
     _check_size(question.sql)
     files, about = _read(question)
     with tempfile.TemporaryFile() as result:
-        try:
-            child = subprocess.run(
-                [sys.executable, "-P", "-m", sandbox.__name__],
-                input=_line(question, form, files) + _stream(about),
-                stdout=result,
-                stderr=subprocess.PIPE,
-                env={**os.environ, **_ENVIRONMENT},
-                timeout=question.timeout_s,
-                check=False,
-            )
-        except subprocess.TimeoutExpired as error:
-            raise QueryError(
-                f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
-                "iteration, or read the Parquet files directly"
-            ) from error
+        child = _asked(question, form, files, about, result)
+        if child.returncode == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
+            files, about = _read(question)
+            result.truncate(0)
+            child = _asked(question, form, files, about, result)
         if child.returncode:
             message = child.stderr.decode(errors="replace").strip()
             if child.returncode == sandbox.DAMAGED:
@@ -141,23 +131,44 @@ def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
         yield result
 
 
+def _asked(
+    question: Question, form: str, files: Mapping[str, RunFiles], about: pa.Table, result: BinaryIO
+) -> subprocess.CompletedProcess[bytes]:
+    """The process that has answered, or has said why not."""
+    try:
+        return subprocess.run(
+            [sys.executable, "-P", "-m", sandbox.__name__],
+            input=_line(question, form, files) + _stream(about),
+            stdout=result,
+            stderr=subprocess.PIPE,
+            env={**os.environ, **_ENVIRONMENT},
+            timeout=question.timeout_s,
+            check=False,
+        )
+    except subprocess.TimeoutExpired as error:
+        raise QueryError(
+            f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
+            "iteration, or read the Parquet files directly"
+        ) from error
+
+
 def _read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
     """Of each table the files that the question may read, by run; and the table `runs`."""
     named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
     of_files, rows = named - {"runs"}, []
-    if of_files:
-        of_files.add("frames")  # which is committed first, and so shows what `episodes` has lost
+    checked = of_files | {"frames"} if of_files else set()  # committed first, it shows what `episodes` has lost
+    read = cache.files if len(question.runs) > 1 else tables.files
     for run in question.runs:
         try:
-            found = tables.files(run, of_files) if of_files else {}
+            found = read(run, checked) if checked else {}
             row = question.about.row(run) if "runs" in named else None
         except T6GpsError as error:
             if question.left_out is None or isinstance(error, StoreError):
                 raise
             question.left_out(str(error))
             continue
-        for table, of_run in found.items():
-            files[table][run.name] = of_run
+        for table in of_files:
+            files[table][run.name] = found[table]
         if row is not None:
             rows.append(row)
     return files, pa.Table.from_pylist(rows, question.about.columns)

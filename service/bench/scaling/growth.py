@@ -18,10 +18,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-import pyarrow as pa
-
 from t6gps.service import config as configuration
+from t6gps.service.bench import replay
 from t6gps.service.bench.rounds import Say
 from t6gps.service.execution.ray_executor import RayExecutor
 from t6gps.service.pool.state import RunState
@@ -57,7 +55,7 @@ class ReplayingWorker:
             "seed": plan.seed,
             "policy_version": snapshot.version,
         }
-        return Episode(_with(recorded.frames, numbers), _with(recorded.summary, numbers))
+        return replay.numbered(recorded, numbers)
 
     def position(self) -> tuple[int, list[dict[str, Any]]]:
         """As of an episode that has not begun."""
@@ -65,15 +63,6 @@ class ReplayingWorker:
 
     def close(self) -> None:
         """Nothing is open."""
-
-
-def _with(table: pa.Table, numbers: dict[str, int]) -> pa.Table:
-    """The table with constants in the place of some of its columns."""
-    for name in set(numbers).intersection(table.column_names):
-        place = table.schema.get_field_index(name)
-        field = table.schema.field(place)
-        table = table.set_column(place, field, pa.array(np.full(table.num_rows, numbers[name]), field.type))
-    return table
 
 
 def growth(episodes: Sequence[Episode], say: Say, factors: Sequence[int] = FACTORS) -> dict[str, float]:
