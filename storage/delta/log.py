@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -40,6 +41,20 @@ def opened(run: Run, table: str) -> DeltaTable | None:
     with readable(run, table):
         there = DeltaTable.is_deltatable(location, storage_options=options)
         return DeltaTable(location, storage_options=options) if there else None
+
+
+def state(run: Run) -> tuple[tuple[int, ...], ...]:
+    """What differs after every commit, and after a file of a table has come, gone, or got another size."""
+    return tuple(_state(run.tables / name) for name in schema.TABLES)
+
+
+def _state(folder: Path) -> tuple[int, ...]:
+    log = folder / "_delta_log"
+    try:
+        sizes = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
+        return folder.stat().st_mtime_ns, len(sizes), sum(sizes), log.stat().st_mtime_ns, len(list(log.iterdir()))
+    except OSError:  # whoever reads the table says why
+        return ()
 
 
 def committed(delta: DeltaTable | None) -> int:

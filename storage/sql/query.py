@@ -1,7 +1,8 @@
 """SQL over the tables of runs, safe for questions from strangers.
 
-DuckDB runs in a child process (`sandbox`) that sees the tables and nothing else: no files, no network,
-no settings; one SELECT, bounded in length, nesting, memory, time and result.
+DuckDB runs in a process of the question's own (`sandbox`) that sees the tables and nothing else: no files, no network,
+no settings; one SELECT, bounded in length, nesting, memory, time and result. `inprocess` answers what the program's own
+user asks.
 """
 
 from __future__ import annotations
@@ -9,15 +10,12 @@ from __future__ import annotations
 import io
 import json
 import mmap
-import os
 import shutil
-import subprocess
-import sys
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass, field
-from typing import BinaryIO, TypeAlias
+from typing import BinaryIO
 
 import pyarrow as pa
 
@@ -26,20 +24,12 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import DataError, QueryError, StoreError, T6GpsError
-from t6gps.storage.sql import cache, sandbox, views
-
-RunFiles: TypeAlias = dict[str, Files]
-"""The files of a table by the names of runs."""
+from t6gps.storage.sql import cache, sandbox, views, warm
+from t6gps.storage.sql.engine import RunFiles
 
 SQL_BYTES_N = 64 * 1024
 BRACKET_DEPTH_N = 100
-_ENVIRONMENT = {
-    # Allocators that reserve address space per thread would eat the child's bound before the query starts.
-    "ARROW_DEFAULT_MEMORY_POOL": "system",
-    "MALLOC_ARENA_MAX": "2",
-    "OMP_NUM_THREADS": "1",
-    "PYTHONIOENCODING": "utf-8",  # of its refusal, whatever the locale
-}
+_WORDS_BYTES_N = 2**16
 
 
 @dataclass(frozen=True)
@@ -114,45 +104,41 @@ def head(question: Question) -> Head:
 @contextmanager
 def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
     """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
-    _check_size(question.sql)
-    files, about = _read(question)
+    check_size(question.sql)
+    files, about = read(question)
     with tempfile.TemporaryFile() as result:
-        child = _asked(question, form, files, about, result)
-        if child.returncode == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
-            files, about = _read(question)
-            result.truncate(0)
-            child = _asked(question, form, files, about, result)
-        if child.returncode:
-            message = child.stderr.decode(errors="replace").strip()
-            if child.returncode == sandbox.DAMAGED:
-                raise _damaged(question.runs, files, *json.loads(message))
-            raise QueryError(_reason(child.returncode, message))
+        status, words = _asked(question, form, files, about, result)
+        if status == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
+            files, about = read(question)
+            result.seek(0)
+            result.truncate()
+            status, words = _asked(question, form, files, about, result)
+        if status == sandbox.DAMAGED:
+            raise damaged(question.runs, files, *json.loads(words))
+        if status:
+            raise QueryError(_reason(status, words))
         result.seek(0)
         yield result
 
 
 def _asked(
     question: Question, form: str, files: Mapping[str, RunFiles], about: pa.Table, result: BinaryIO
-) -> subprocess.CompletedProcess[bytes]:
-    """The process that has answered, or has said why not."""
-    try:
-        return subprocess.run(
-            [sys.executable, "-P", "-m", sandbox.__name__],
-            input=_line(question, form, files) + _stream(about),
-            stdout=result,
-            stderr=subprocess.PIPE,
-            env={**os.environ, **_ENVIRONMENT},
-            timeout=question.timeout_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise QueryError(
-            f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
-            "iteration, or read the Parquet files directly"
-        ) from error
+) -> tuple[int, str]:
+    """How the process that has answered ended, and its words. QueryError where its seconds were over."""
+    with tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as words:
+        asked.write(_line(question, form, files) + _stream(about))
+        asked.seek(0)
+        status = warm.running().answered(asked, result, words, question.timeout_s)
+        if status is None:
+            raise QueryError(
+                f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
+                "iteration, or read the Parquet files directly"
+            )
+        words.seek(0)
+        return status, words.read(_WORDS_BYTES_N).decode(errors="replace").strip()
 
 
-def _read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
+def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
     """Of each table the files that the question may read, by run; and the table `runs`."""
     named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
     of_files, rows = named - {"runs"}, []
@@ -192,7 +178,7 @@ def _stream(table: pa.Table) -> bytes:
     return sink.getvalue()
 
 
-def _damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
+def damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
     """The error for a table that cannot be read to its end. It names the run, which the query's process cannot."""
     for run in runs:
         try:
@@ -204,7 +190,8 @@ def _damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why
     return log.damaged(runs[0], table, why)
 
 
-def _check_size(sql: str) -> None:
+def check_size(sql: str) -> None:
+    """Raise QueryError for SQL that is too long, nests too deep, or is no Unicode."""
     try:
         size_n = len(sql.encode())
     except UnicodeEncodeError as error:
