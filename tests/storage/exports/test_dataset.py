@@ -274,8 +274,8 @@ def test_no_more_than_a_few_row_groups_are_in_memory(
     tmp_path: Path, make_episode: Callable[..., Episode], learn: Callable[..., Learned]
 ) -> None:
     run = catalog.create(tmp_path / "runs", "long", "{}")
-    iterations.commit(run, 0, (make_episode(number, 0, steps=20) for number in range(120)), learn(0))
-    source = selection.source(run, [number for number in range(120) if number != 7], {}, {})
+    iterations.commit(run, 0, (make_episode(number, 0, steps=20) for number in range(80)), learn(0))
+    source = selection.source(run, [number for number in range(80) if number != 7], {}, {})
     held, most_n, all_n = pa.total_allocated_bytes(), 0, 0
     for numbered in selection.episodes([source]):
         all_n += numbered.episode.frames.nbytes
