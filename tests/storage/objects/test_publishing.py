@@ -1,6 +1,7 @@
 """Laws of copying runs into an object store: whole at any moment, never over another, never where commits are lost."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -123,6 +124,25 @@ def test_a_run_that_went_on_elsewhere_is_refused(objects: ObjectPath, tmp_path: 
     with pytest.raises(RunError, match="another run"):
         copying.copy(second, objects, "both", quiet)
     assert verification.verify(Run(objects / "both")) == []
+
+
+def test_of_two_that_publish_one_run_as_it_went_on_one_is_refused(objects: ObjectPath, tmp_path: Path) -> None:
+    first = synthetic.made(tmp_path, 1)
+    second = catalog.copy(first, tmp_path, "second")
+    for run in (first, second):
+        synthetic.commit(run, 1)
+
+    def refused(run: Run) -> bool:
+        try:
+            publishing.publish(run.path, objects / "both")
+        except RunError:
+            return True
+        return False
+
+    with ThreadPoolExecutor(2) as threads:
+        assert sorted(threads.map(refused, (first, second))) == [False, True]
+    assert verification.verify(Run(objects / "both")) == []
+    assert tables.committed_iterations(Run(objects / "both")) == 2
 
 
 def test_a_file_that_another_writer_left_without_its_log_entry_is_not_taken_for_ours(
