@@ -16,6 +16,7 @@ from pydantic import BaseModel, Field, JsonValue, ValidationError, model_validat
 from t6gps.learner.settings import LearnerSettings, Localization
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
+from t6gps.storage.objects import place
 from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
 
@@ -150,7 +151,8 @@ def _with_whole_paths(config: Config) -> Config:
     if config.terrain.file is None:
         return config
     try:
-        return with_ground(config, Path(config.terrain.file).expanduser().resolve())
+        file = place.at(config.terrain.file)
+        return with_ground(config, file if place.is_object(file) else file.expanduser().resolve())
     except RuntimeError as error:
         raise ConfigError(f"terrain.file = {config.terrain.file} leads nowhere: {error}; correct it") from None
 

@@ -7,7 +7,6 @@ from typing import Annotated
 
 import typer
 
-from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.objects import place
 
@@ -16,18 +15,13 @@ INTERRUPTED = 130
 """The exit code of a command that Ctrl-C has ended."""
 
 
-def _root(text: str | Path) -> Path:
-    path = Path(text)
-    return catalog.whole(path) if place.is_object(path) else path
-
-
 Root = Annotated[
     Path,
     typer.Option(
         "--root",
         envvar="T6GPS_ROOT",
         metavar="FOLDER|s3://BUCKET/PREFIX",
-        parser=_root,
+        parser=place.at,
         help="Folder that holds the runs, or an object store to read them from.",
     ),
 ]

@@ -19,6 +19,7 @@ from t6gps.service.config import Config
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError, TerrainError
+from t6gps.storage.objects import place
 from t6gps.storage.schema import SCHEMA_VERSION
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.settings import TerrainSettings
@@ -52,7 +53,7 @@ def create(config: Config, root: Path, name: str, numbered: bool = False) -> Run
     """Create a run that owns what it depends on. Errors as `catalog.create`; TerrainError for a file of no ground."""
     path, files, copy = config.terrain.file, dict[str, bytes](), None
     if path is not None:
-        content = _ground(config.terrain, Path(path))
+        content = _ground(config.terrain, place.at(path))
         copy = Ground(file=f"ground/{Path(path).name}", sha256=provenance.sha256(content))
         files[copy.file] = content
     files[FILE] = (_present(copy).model_dump_json(indent=2, exclude_none=True) + "\n").encode()

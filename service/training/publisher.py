@@ -21,11 +21,14 @@ from t6gps.storage.objects.place import ObjectPath
 
 AGAIN_S, END_S = 2.0, 60.0
 PIECE_BYTES = 4096
+NICENESS = 10
+"""Workers and learner go first."""
 
 
 def main() -> int:
     """Copy until the input ends; 0 when everything is there."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # of the terminal; whoever started this process ends it
+    os.nice(NICENESS)
     run, target = Run(Path(sys.argv[1])), place.whole(Path(sys.argv[2]))
     probed, until_s = False, float("inf")
     while True:

@@ -64,6 +64,7 @@ def beside(run: Run, root: ObjectPath | None, observer: Observer) -> Iterator[Ob
     process, done = _Process(run, root / run.name), False
     try:
         yield _Teller(observer, process)
+        process.wake()  # also where it has died
         done = process.end(LAST_WAIT_S)
     finally:
         if not done:

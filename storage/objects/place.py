@@ -38,6 +38,11 @@ def is_object(path: Path) -> bool:
     return path.parts[:1] == (SCHEME,)
 
 
+def at(path: str | Path) -> Path:
+    """A path of this machine as it is, or a place in an object store. Errors as `whole`."""
+    return whole(Path(path)) if is_object(Path(path)) else Path(path)
+
+
 def whole(path: Path) -> ObjectPath:
     """A place in an object store. RunError for an address that none can have, ConfigError without keys or obstore."""
     store.access()
@@ -183,7 +188,8 @@ def only_read(path: ObjectPath) -> StoreError:
 
 def _stat(kind: int, size: int, changed: datetime) -> os.stat_result:
     time_s = int(changed.timestamp())
-    return os.stat_result((kind | 0o444, 0, 0, 1, 0, 0, size, time_s, time_s, time_s))
+    exact = {"st_mtime_ns": int(changed.timestamp() * 1e6) * 1000}
+    return os.stat_result((kind | 0o444, 0, 0, 1, 0, 0, size, time_s, time_s, time_s), exact)
 
 
 def sizes(folder: Path) -> dict[str, int]:

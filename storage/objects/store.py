@@ -75,6 +75,7 @@ def access() -> Access:
                 f"AWS_ENDPOINT_URL={endpoint} would send data as plain text over the network; use https, or set "
                 "AWS_ALLOW_HTTP=true"
             )
+        endpoint = endpoint.rstrip("/")
     key, secret = (os.environ[name] for name in _KEYS)
     return Access(key, secret, os.environ.get("AWS_SESSION_TOKEN") or None, region, endpoint)
 

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-from pathlib import Path
-
 import numpy as np
 
+from t6gps.storage.objects import place
 from t6gps.workers.ground.surface import load
 from t6gps.workers.ground.terrain import Terrain, generate
 from t6gps.workers.settings import TerrainSettings
@@ -17,7 +16,7 @@ FENCE_HEIGHT_M = 2.0
 def ground(settings: TerrainSettings, seed: int, difficulty: float) -> Terrain | None:
     """Ground of an episode, None for the endless plane. Raises TerrainError as `generate` and `surface.load`."""
     if settings.file is not None:
-        terrain = load(Path(settings.file), settings.size_m, settings.png_range_m, settings.accept)
+        terrain = load(place.at(settings.file), settings.size_m, settings.png_range_m, settings.accept)
     elif difficulty > 0 or settings.tilt_deg > 0:
         terrain = generate(seed, difficulty, settings.size_m)
     else:

@@ -1,6 +1,7 @@
 """Laws of copying runs into an object store: whole at any moment, never over another, never where commits are lost."""
 
 import shutil
+from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 
 import numpy as np
@@ -10,12 +11,14 @@ import pytest
 import synthetic
 from run_digest import digests
 
-from t6gps.service.training import copying, verification
+from t6gps.service.config import load
+from t6gps.service.training import copying, origin, verification
 from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, RunError, StoreError, StoreUnreachableError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
+from t6gps.workers.ground import ground
 
 
 def quiet(done: int, total: int) -> None:
@@ -79,6 +82,18 @@ def test_checkpoints_that_the_run_has_removed_go(objects: ObjectPath, tmp_path: 
     assert checkpoint.load(copies / "iteration-000007")[0] == 7
 
 
+def test_a_run_in_a_store_has_its_ground(objects: ObjectPath, tmp_path: Path) -> None:
+    np.save(tmp_path / "hills.npy", np.linspace(0, 1, 81 * 81).reshape(81, 81))
+    config = load("flat-quick", [f'terrain.file="{tmp_path / "hills.npy"}"'])
+    run = origin.create(config, tmp_path, "hills")
+    publishing.publish(run.path, objects / "hills")
+    here, there = (origin.configured(each, ["run.steps=40"]) for each in (run, Run(objects / "hills")))
+    assert there.terrain.file == f"{objects}/hills/ground/hills.npy"
+    grounds = [ground.ground(each.terrain, 0, 0.0) for each in (here, there)]
+    assert all(each is not None for each in grounds)
+    np.testing.assert_array_equal(*(each.heights for each in grounds if each is not None))
+
+
 def test_what_is_there_is_not_sent_again(run: Run, objects: ObjectPath) -> None:
     counts = []
     for _ in range(2):
@@ -109,6 +124,25 @@ def test_a_run_that_went_on_elsewhere_is_refused(objects: ObjectPath, tmp_path: 
     with pytest.raises(RunError, match="another run"):
         copying.copy(second, objects, "both", quiet)
     assert verification.verify(Run(objects / "both")) == []
+
+
+def test_of_two_that_publish_one_run_as_it_went_on_one_is_refused(objects: ObjectPath, tmp_path: Path) -> None:
+    first = synthetic.made(tmp_path, 1)
+    second = catalog.copy(first, tmp_path, "second")
+    for run in (first, second):
+        synthetic.commit(run, 1)
+
+    def refused(run: Run) -> bool:
+        try:
+            publishing.publish(run.path, objects / "both")
+        except RunError:
+            return True
+        return False
+
+    with ThreadPoolExecutor(2) as threads:
+        assert sorted(threads.map(refused, (first, second))) == [False, True]
+    assert verification.verify(Run(objects / "both")) == []
+    assert tables.committed_iterations(Run(objects / "both")) == 2
 
 
 def test_a_file_that_another_writer_left_without_its_log_entry_is_not_taken_for_ours(
