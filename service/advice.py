@@ -10,6 +10,7 @@ FULL = "the disk is full: remove what is not needed there, or choose another fol
 REMEDIES = {
     errno.ENOSPC: FULL,
     errno.EDQUOT: "your quota is used up: remove what is not needed there, or choose another folder",
+    errno.EFBIG: "a limit holds for the size of files: raise it (ulimit -f unlimited)",
     errno.EROFS: "the file system is read-only: choose another folder, or mount it writable",
     errno.EACCES: "permission is missing: choose another folder, or give your user access to this one",
     errno.EPERM: "permission is missing: choose another folder, or give your user access to this one",

@@ -101,7 +101,7 @@ def opened(run: Run, table: str) -> Found:
             return found
         with log.readable(run, table):
             actions = pa.table(delta.get_add_actions(flatten=True)).sort_by("path").to_pylist()
-            wrong = _schema_wrong(table, pa.schema(delta.schema().to_arrow()))
+            wrong = parquet.differs(table, pa.schema(delta.schema().to_arrow()))
     except DataError as error:
         wrong = str(error)
     else:
@@ -159,7 +159,7 @@ def _keys(table: str, entry: Entry) -> pa.Table:
     if entry.sha256 not in (None, durable.sha256(entry.path)):
         raise ValueError("it was altered: it fails the SHA-256 in its log")
     with pq.ParquetFile(place.source(entry.path), page_checksum_verification=True) as file:
-        wrong = _schema_wrong(table, file.schema_arrow)
+        wrong = parquet.differs(table, file.schema_arrow)
         if wrong is not None:
             raise ValueError(wrong)
         groups = [schema.TABLES[table].empty_table().select(KEYS[table])]
@@ -182,18 +182,6 @@ def _keys(table: str, entry: Entry) -> pa.Table:
 def _bare(table: str) -> pa.Schema:
     """The keys' types alone: units and whether null is allowed may differ between versions."""
     return pa.schema([(name, schema.TABLES[table].field(name).type) for name in KEYS[table]])
-
-
-def _schema_wrong(table: str, there: pa.Schema) -> str | None:
-    """How columns differ from those of the table, of which older files may lack some that may be null."""
-    for column in schema.TABLES[table]:
-        if column.name not in there.names:
-            if not column.nullable:
-                return f"column {column.name} is missing"
-        elif there.field(column.name).type != column.type:
-            return f"column {column.name} must be {column.type}, found {there.field(column.name).type}"
-    unknown = set(there.names) - set(schema.TABLES[table].names)
-    return f"column {min(unknown)} is unknown" if unknown else None
 
 
 def _by_episode(keys: pa.Table) -> pa.Table:

@@ -12,10 +12,13 @@ from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
-from t6gps.storage import catalog, durable
+import pyarrow as pa
+
+from t6gps.storage import catalog, durable, schema
 from t6gps.storage.care import losses, mending
 from t6gps.storage.care.fault import Fault
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import log, parquet
 from t6gps.storage.errors import RunError
 
 
@@ -30,9 +33,12 @@ class Repaired:
 def repair(run: Run, copy: Run | None, verify: Callable[[Run], list[Fault]]) -> Repaired:
     """Mend a run that nobody uses. RunError where somebody does, for a copy of another, or one that takes no files.
 
+    DataError for a run of a later version.
+
     verify   all faults of a run
     """
     with catalog.locked(run), catalog.unevaluated(run):
+        _check_version(run)
         faults = verify(run)
         if not faults:
             return Repaired([], [])
@@ -46,6 +52,17 @@ def repair(run: Run, copy: Run | None, verify: Callable[[Run], list[Fault]]) -> 
                 f"cannot repair run {run.name}: {error}; make room beside it, with leave to write"
             ) from error
         return Repaired(sentences, verify(run))
+
+
+def _check_version(run: Run) -> None:
+    """DataError for a run of a later version, whose columns would look like damage."""
+    for file in sorted(run.tables.glob("*/*.parquet")):
+        try:
+            version = parquet.version(str(file))
+        except (pa.ArrowException, OSError):  # which is what there is to repair
+            continue
+        if version > schema.SCHEMA_VERSION:
+            raise log.newer(run, version)
 
 
 def _mended(

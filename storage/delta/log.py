@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import time
 from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
@@ -29,6 +30,9 @@ IDENTITIES = {"iteration", "episode_id", "evaluation_id", "version"}
 
 SHA256 = "sha256"
 """What a commit calls the digest of its file, which covers what no checksum of a page does."""
+
+_COLOUR = re.compile("\x1b\\[[0-9;]*m")
+_SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
 
 _APPLICATION = "t6gps"
 """Application id of the Delta transactions; their version is the number of the file."""
@@ -64,7 +68,10 @@ def committed(delta: DeltaTable | None) -> int:
 
 
 def files(run: Run, table: str, delta: DeltaTable) -> list[str]:
-    """The table's files by name. DataError where one is missing or has another size than its commit says."""
+    """The table's files by name. DataError where one is missing or has another size than its commit says.
+
+    Also where the newest has other columns than the table.
+    """
     with readable(run, table):
         actions = pa.table(delta.get_add_actions(flatten=True)).select(["path", "size_bytes"]).sort_by("path")
         sizes = {row["path"]: row["size_bytes"] for row in actions.to_pylist()}
@@ -72,7 +79,19 @@ def files(run: Run, table: str, delta: DeltaTable) -> list[str]:
         for file, size in sizes.items():
             if there.get(file) != size:
                 raise damaged(run, table, f"{file} has {size} bytes, found {there.get(file, 'none')}")
+        for file in list(sizes)[-1:]:  # the newest, which says what wrote last
+            _check(run, table, run.tables / table / file)
     return [str(run.tables / table / file) for file in sizes]
+
+
+def _check(run: Run, table: str, file: Path) -> None:
+    """DataError for a file of a later version, or with columns of something else."""
+    there = parquet.schema_of(str(file))
+    if parquet.version_of(there) > schema.SCHEMA_VERSION:
+        raise newer(run, parquet.version_of(there))
+    wrong = parquet.differs(table, there)
+    if wrong is not None:
+        raise damaged(run, table, f"{file.name}: {wrong}")
 
 
 def add(run: Run, table: str, number: int, stem: str, groups: Iterable[pa.Table]) -> None:
@@ -107,22 +126,35 @@ def add_again(run: Run, table: str, number: int, file: Path) -> None:
 def _commit(run: Run, table: str, file: Path, number: int, statistics: _Statistics) -> None:
     """Make a file that is on disk part of its table, durably."""
     folder, definition = run.tables / table, Schema.from_arrow(schema.TABLES[table])
-    delta = opened(run, table) or DeltaTable.create(str(folder), definition)
-    delta.create_write_transaction(
-        [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
-        "append",
-        definition,
-        commit_properties=CommitProperties(
-            custom_metadata={SHA256: durable.sha256(file)}, app_transactions=[Transaction(_APPLICATION, number)]
-        ),
-        # Checkpoints of the log are not forced to disk by the library; a run's log is short enough without.
-        post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
-    )
+    with _writing(folder):
+        delta = opened(run, table) or DeltaTable.create(str(folder), definition)
+        delta.create_write_transaction(
+            [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
+            "append",
+            definition,
+            commit_properties=CommitProperties(
+                custom_metadata={SHA256: durable.sha256(file)}, app_transactions=[Transaction(_APPLICATION, number)]
+            ),
+            # Checkpoints of the log are not forced to disk by the library; a run's log is short enough without.
+            post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
+        )
     log = folder / "_delta_log"
     for entry in sorted(log.glob("*.json"))[-2:]:  # the commit, and the table's creation before the first
         durable.sync(entry)
     for parent in (log, folder, run.tables):
         durable.sync(parent)
+
+
+@contextmanager
+def _writing(folder: Path) -> Iterator[None]:
+    """What the library says of an error of the system, such as a full disk, becomes that error, with its number."""
+    try:
+        yield
+    except (DeltaError, OSError) as error:
+        number = _SYSTEM_ERROR.search(str(error))
+        if number is None:
+            raise
+        raise OSError(int(number[1]), os.strerror(int(number[1])), str(folder)) from error
 
 
 @contextmanager
@@ -132,8 +164,14 @@ def readable(run: Run, table: str) -> Iterator[None]:
         yield
     except (DeltaError, pa.ArrowException, OSError) as error:
         place.answers(run.path)
-        lines = str(error).splitlines() or [type(error).__name__]
-        raise damaged(run, table, lines[0][:MESSAGE_LENGTH_N]) from error
+        raise damaged(run, table, _reason(error)) from error
+
+
+def _reason(error: Exception) -> str:
+    """A library's message in a line: Delta's may be a coloured chain of causes, others name places in their code."""
+    lines = _COLOUR.sub("", str(error)).splitlines() or [type(error).__name__]
+    causes = [line.strip(" ↳") for line in lines if "↳" in line]
+    return ": ".join([lines[0].strip(), *causes])[:MESSAGE_LENGTH_N]
 
 
 def damaged(run: Run, table: str, what: str) -> DataError:
@@ -141,6 +179,14 @@ def damaged(run: Run, table: str, what: str) -> DataError:
     return DataError(
         f"run {run.name} is not whole: table {table} in {run.tables / table} cannot be read: {what}; "
         f"restore the run from a copy: t6gps repair {run.name} --from COPY"
+    )
+
+
+def newer(run: Run, version: int) -> DataError:
+    """The error for a run of a later version of the tables."""
+    return DataError(
+        f"run {run.name} has tables of version {version}, and this version reads up to {schema.SCHEMA_VERSION}; "
+        "install the t6gps that wrote them"
     )
 
 

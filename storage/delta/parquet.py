@@ -115,9 +115,32 @@ def _seen(definition: pa.Schema, iterations_n: int) -> pc.Expression:
 
 def version(file: str) -> int:
     """The schema version of a file's rows, 0 where another program wrote it. OSError or ArrowException without one."""
+    return version_of(schema_of(file))
+
+
+def schema_of(file: str) -> pa.Schema:
+    """The columns of a file, here or in an object store. OSError or ArrowException where it cannot be read."""
     file_system, (path,) = place.located([file])
-    found = pq.read_schema(path, filesystem=file_system).metadata or {}
-    return int(found.get(b"t6gps_schema_version", b"0"))
+    return pq.read_schema(path, filesystem=file_system)
+
+
+def differs(table: str, there: pa.Schema) -> str | None:
+    """How columns differ from those of the table, of which older files may lack some that may be null."""
+    if version_of(there) > schema.SCHEMA_VERSION:
+        return f"it is of version {version_of(there)}, and this t6gps reads up to {schema.SCHEMA_VERSION}"
+    for column in schema.TABLES[table]:
+        if column.name not in there.names:
+            if not column.nullable:
+                return f"column {column.name} is missing"
+        elif there.field(column.name).type != column.type:
+            return f"column {column.name} must be {column.type}, found {there.field(column.name).type}"
+    unknown = set(there.names) - set(schema.TABLES[table].names)
+    return f"column {min(unknown)} is unknown" if unknown else None
+
+
+def version_of(there: pa.Schema) -> int:
+    """The version of a file with this schema, 0 where another program wrote it."""
+    return int((there.metadata or {}).get(b"t6gps_schema_version", b"0"))
 
 
 def _leaf(kind: pa.DataType) -> pa.DataType:

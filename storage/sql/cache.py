@@ -158,9 +158,10 @@ def _write(run: Run, entry: Path, found: Whole) -> None:
 
 def _read(run: Run) -> Whole:
     """What the tables say."""
-    done, found = tables.committed_iterations(run), tables.files(run)
-    newest = _rows(run, "iterations", found["iterations"]).sort_by([("iteration", "descending")])[:1].to_pylist()
-    return Whole(done, newest[0] if newest else {}, found)
+    found = tables.files(run)
+    rows = _rows(run, "iterations", found["iterations"]).sort_by([("iteration", "descending")])[:1].to_pylist()
+    newest = rows[0] if rows else {}
+    return Whole(newest.get("iteration", -1) + 1, newest, found)
 
 
 def _rows(run: Run, table: str, found: Files) -> pa.Table:

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import errno
 import os
 import re
 import shutil
@@ -16,8 +17,10 @@ from deltalake import DeltaTable, write_deltalake
 from deltalake.transaction import CommitProperties, Transaction
 
 from t6gps.storage import catalog, fields, schema, tables
+from t6gps.storage.care.repair import repair
+from t6gps.storage.care.verify import verify
 from t6gps.storage.catalog import Run
-from t6gps.storage.delta import iterations, policies
+from t6gps.storage.delta import iterations, log, policies
 from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.records import Episode
 from t6gps.storage.sql.query import Question, query
@@ -315,6 +318,64 @@ def test_damage_is_one_clear_error(run: Run, commit: Any, table: str, damage: st
     assert "\n" not in str(refused.value)
     with pytest.raises(DataError, match="run trial is not whole"):
         query(Question([run], f"SELECT count(*) FROM {table}"))
+
+
+def written_by_others(run: Run, table: str, version: int, names: list[str]) -> None:
+    """Let another program write the newest file of a table, of a version and with columns of its own."""
+    file = sorted((run.tables / table).glob("*.parquet"))[-1]
+    rows = pq.read_table(file)
+    kept = pa.table([rows.column(min(rows.num_columns - 1, place)) for place in range(len(names))], names=names)
+    pq.write_table(kept.replace_schema_metadata({"t6gps_schema_version": str(version)}), file)
+    entry = sorted((file.parent / "_delta_log").glob("*.json"))[-1]
+    entry.write_text(re.sub(r'"size":\d+', f'"size":{file.stat().st_size}', entry.read_text()))
+
+
+@pytest.mark.parametrize("table", schema.OF_ITERATIONS)
+def test_a_run_of_a_later_version_is_refused_and_not_misread(run: Run, commit: Any, table: str) -> None:
+    for iteration in range(2):
+        commit(run, iteration)
+    names = [*schema.TABLES[table].names, "of_a_later_version"]
+    written_by_others(run, table, schema.SCHEMA_VERSION + 1, names)
+    refused = rf"run trial has tables of version {schema.SCHEMA_VERSION + 1}, and this version reads up to .*; install"
+    for ask in (tables.files, lambda run: tables.read(run, table)):
+        with pytest.raises(DataError, match=refused):
+            ask(run)
+    with pytest.raises(DataError, match=refused):
+        query(Question([run], f"SELECT count(*) FROM {table}"))
+    before = _snapshot(run)
+    with pytest.raises(DataError, match=refused):
+        repair(run, None, verify)
+    assert _snapshot(run).keys() == before.keys(), "it is no damage"
+
+
+def test_columns_of_something_else_are_refused_and_never_null(run: Run, commit: Any) -> None:
+    commit(run, 0)
+    whole = schema.FRAMES.names
+    for names, wrong in (([*whole[1::-1], *whole[2:]], "must be int64, found int32"), (whole[1:], "is missing")):
+        written_by_others(run, "frames", 0, names)
+        with pytest.raises(DataError, match=rf"table frames .*000000\.parquet: column episode_id {wrong}.*; restore"):
+            tables.read(run, "frames", ["cost"])
+
+
+def test_a_full_disk_is_an_error_of_the_system_wherever_it_comes_and_loses_nothing(
+    run: Run, commit: Any, full_disk: Any, bits: Any
+) -> None:
+    commit(run, 0)
+    before = _snapshot(run)
+    with full_disk(), pytest.raises(OSError, match="File too large"):
+        commit(run, 1)
+    assert _snapshot(run) == before
+    log_file = run.tables / "classes" / "_delta_log" / f"{1:020d}.json"
+    kept = log_file.read_bytes()
+    log_file.unlink()
+    rows_file = run.tables / "classes" / "iteration-000000.parquet"
+    with full_disk(), pytest.raises(OSError, match="File too large") as refused:
+        log.add_again(run, "classes", 0, rows_file)
+    assert (refused.value.errno, refused.value.filename) == (errno.EFBIG, str(rows_file.parent))
+    log_file.write_bytes(kept)
+    episodes = commit(run, 1)
+    assert tables.committed_iterations(run) == 2
+    assert bits(tables.episode(run, 101).frames) == bits(episodes[1].frames)
 
 
 def test_a_byte_that_has_changed_in_a_page_is_damage_and_never_an_answer(run: Run, commit: Any) -> None:
