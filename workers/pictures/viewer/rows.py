@@ -21,9 +21,7 @@ class Rows:
 
     def __init__(self, stream: rr.RecordingStream, frames: pa.Table) -> None:
         self.stream, self.frames = stream, frames
-        self._step = np.asarray(schema.array(frames, "step"))
-        # Rerun cuts seconds off to nanoseconds: 0.3 s would be 299,999,999 ns.
-        self._time = np.rint(numbers(frames, "time_s") * 1e9).astype("timedelta64[ns]")
+        self._step, self._time_s = np.asarray(schema.array(frames, "step")), numbers(frames, "time_s")
 
     def log(self, entity: str, always: rr.AsComponents) -> None:
         """Log what holds for the whole episode."""
@@ -33,7 +31,7 @@ class Rows:
         """Send columns with an entry for each row, or for the `chosen` ones."""
         rows = slice(None) if chosen is None else chosen
         step = rr.TimeColumn("step", sequence=self._step[rows])
-        time = rr.TimeColumn("time", duration=self._time[rows])
+        time = rr.TimeColumn("time", duration=self._time_s[rows])
         self.stream.send_columns(entity, [step, time], columns)
 
     def send_changes(self, entity: str, states: Sequence[str]) -> None:

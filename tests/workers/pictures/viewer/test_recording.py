@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
+from itertools import pairwise
 from pathlib import Path
 
 import numpy as np
@@ -22,8 +23,8 @@ from t6gps.workers.pictures.viewer.recording import recorded
 from t6gps.workers.pictures.viewer.world import World
 from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.state import RobotState
-from t6gps.workers.robot.symmetry import CABLES_FROM, ELEMENTS_N
-from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES, CABLES_N, FACES
+from t6gps.workers.robot.symmetry import CABLES_FROM, EDGE_NAMES, ELEMENTS_N
+from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES, CABLES_N, FACES, KIND_NAMES
 from t6gps.workers.settings import RandomisationSettings, RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
 from t6gps.workers.worker import RolloutWorker
 
@@ -174,6 +175,8 @@ def test_tensions_lie_between_slack_and_twice_the_elastic_force(rows: pa.Table, 
     assert (tension >= 0).all()
     assert (tension <= 2 * elastic + 1e-6).all()
     assert (tension[elastic == 0] == 0).all()
+    share = tension[elastic > 1] / elastic[elastic > 1]
+    assert share.max() == pytest.approx(2, rel=1e-6), "where a cable lengthens fast"
 
 
 @pytest.mark.parametrize("stiffness", [1000.0, 2000.0])
@@ -266,10 +269,16 @@ def test_segments_begin_where_the_triangle_changes(rows: pa.Table, episode: Epis
     begins = [0, *(np.flatnonzero(np.diff(face)) + 1).tolist()]
     assert at(rows, "/segments/class:StateChange:state").tolist() == begins
     names = values(rows, "/segments/class:StateChange:state")
-    kinds = schema.array(episode.frames, "kind")[begins]
-    assert [name.split(":")[0] for name in names] == [("Delta", "Lambda")[kind] for kind in kinds]
-    assert names[0].split(": ")[1].startswith("... →"), "nobody knows how the first triangle was entered"
-    assert names[-1].endswith("→ ...")
+    kinds = schema.array(episode.frames, "kind")[begins].tolist()
+    entry, exit_ = (episode.frames[f"{way}_edge"].to_pylist() for way in ("entry", "exit"))
+    ends = [(entry[first], exit_[last - 1]) for first, last in pairwise([*begins, len(face)])]
+    assert names.tolist() == [
+        f"{KIND_NAMES[kind]}: " + " → ".join("..." if edge is None else EDGE_NAMES[kind][edge] for edge in edges)
+        for kind, edges in zip(kinds, ends, strict=True)
+    ]
+    assert ends[0][0] is None, "nobody knows how the first triangle was entered"
+    assert ends[-1][1] is None
+    assert len([edges for edges in ends if None not in edges]) > 1
 
 
 def test_a_robot_that_stays_is_stuck_from_the_second_second_on(episode: Episode, world: World, tmp_path: Path) -> None:
