@@ -74,10 +74,11 @@ class Far:
         return self.client.table(name, table)
 
     def episode(self, name: str, number: int, evaluation: int | None) -> Episode:
-        frames = self.client.episode(name, number)
-        return Episode(
-            frames, self.client.query(name, f"SELECT * EXCLUDE (run) FROM episodes WHERE episode_id = {number}")
-        )
+        frames = self.client.episode(name, number, evaluation)
+        table, of = ("episodes", "") if evaluation is None else ("evaluation_episodes", "AND evaluation_id = $of")
+        parameters = {"number": number} if evaluation is None else {"number": number, "of": evaluation}
+        sql = f"SELECT * EXCLUDE (run) FROM {table} WHERE episode_id = $number {of}"
+        return Episode(frames, self.client.query(name, sql, **parameters))
 
     def policy(self, name: str, version: int | None) -> PolicySnapshot:
         chosen = policies.chosen_of(name, self.client.versions(name), version)

@@ -42,7 +42,7 @@ from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.service.steering.status import Status
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
-from t6gps.storage import catalog
+from t6gps.storage import catalog, schema
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.storage.sql.query import Head
@@ -170,13 +170,13 @@ class Client:
         self.write(runs, sql, QueryForm.ARROW, sink, parameters, _refuse)
         return self._server.table(sink.getvalue())
 
-    def episode(self, name: str, number: int) -> pa.Table:
-        """The frames of an episode, bit for bit."""
-        return self._server.table(self._server.ask("GET", f"{_run(name)}/episodes/{int(number)}"))
+    def episode(self, name: str, number: int, evaluation: int | None = None) -> pa.Table:
+        """The frames of an episode of training, or of an evaluation, bit for bit."""
+        return self._server.table(self._server.ask("GET", f"{_run(name)}/episodes/{_episode(number, evaluation)}"))
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""
-        return self.query(name, f"SELECT * EXCLUDE (run) FROM {table} ORDER BY iteration")
+        return self.query(name, f"SELECT * EXCLUDE (run) FROM {table} ORDER BY {_place(table)}")
 
     def write(self, runs: str, sql: str, form: str, sink: BinaryIO, parameters: Parameters, warn: Warn) -> None:
         """Write such a result as arrow (an IPC stream), parquet, csv or json. `warn` is told of runs left out."""
@@ -217,6 +217,16 @@ def _question(runs: str, sql: str, form: str, parameters: Parameters) -> QueryRe
 
 def _refuse(warning: str) -> None:
     raise RunError(f"{warning}; name the other runs")
+
+
+def _place(table: str) -> str:
+    """The column that says where in its table a row stands."""
+    return "evaluation_id" if table in schema.OF_EVALUATIONS else "iteration"
+
+
+def _episode(number: int, evaluation: int | None) -> str:
+    """Where an episode is among those of its run."""
+    return f"{int(number)}" if evaluation is None else f"{int(number)}?evaluation={int(evaluation)}"
 
 
 def _run(name: str) -> str:

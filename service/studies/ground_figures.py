@@ -22,9 +22,7 @@ from t6gps.service.views import run_figures
 from t6gps.service.views.run_figures import (
     BLUE,
     DARK,
-    EDGES,
     GREY,
-    KINDS,
     ORANGE,
     RED,
     STYLE,
@@ -39,7 +37,8 @@ from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures import render
 from t6gps.workers.pictures.scene import Sizes
 from t6gps.workers.robot.state import RobotState
-from t6gps.workers.robot.topology import BAR_LENGTH_M, DELTA, FACES, LAMBDA
+from t6gps.workers.robot.symmetry import EDGE_NAMES
+from t6gps.workers.robot.topology import BAR_LENGTH_M, DELTA, FACES, KIND_NAMES, LAMBDA
 
 Array = NDArray[np.float64]
 
@@ -222,8 +221,8 @@ def any_axis(finished: Sequence[Finished]) -> Figure:
     with rc_context(STYLE):
         figure = canvas(12, 3.8)
         delta, lambda_, edges = figure.subplots(1, 3)
-        _directions(delta, KINDS[DELTA], angle_deg[moving & (kind == DELTA)] % 120, 120)
-        _directions(lambda_, KINDS[LAMBDA], np.abs(angle_deg[moving & (kind == LAMBDA)]), 180)
+        _directions(delta, KIND_NAMES[DELTA], angle_deg[moving & (kind == DELTA)] % 120, 120)
+        _directions(lambda_, KIND_NAMES[LAMBDA], np.abs(angle_deg[moving & (kind == LAMBDA)]), 180)
         delta.set_xlabel("direction relative to the triangle, modulo 120° (°)")
         lambda_.set_xlabel("direction from the axis of the triangle (°)")
         _crossings(edges, counts)
@@ -307,7 +306,10 @@ def _crossings(axes: Axes, counts: pa.Table) -> None:
     rows = counts.to_pylist()
     total = {kind: sum(row["transitions_sum"] for row in rows if row["kind"] == kind) for kind in (DELTA, LAMBDA)}
     shares = [100 * row["transitions_sum"] / total[row["kind"]] for row in rows]
-    names = [f"{KINDS[k]} {EDGES[k][a]} → {EDGES[k][b]}" for k, a, b in (tuple(row[n] for n in ORDER) for row in rows)]
+    names = [
+        f"{KIND_NAMES[k]} {EDGE_NAMES[k][a]} → {EDGE_NAMES[k][b]}"
+        for k, a, b in (tuple(row[n] for n in ORDER) for row in rows)
+    ]
     bars = axes.barh(range(len(rows)), shares, color=[(BLUE, ORANGE)[row["kind"]] for row in rows])
     axes.bar_label(bars, fmt="%.0f", padding=3, fontsize=8)
     axes.set_yticks(range(len(rows)), names, fontsize=8)

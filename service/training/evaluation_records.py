@@ -9,7 +9,7 @@ from dataclasses import dataclass
 from datetime import UTC, datetime
 from enum import StrEnum
 
-import pyarrow.compute as pc
+import pyarrow as pa
 
 from t6gps.service import config as configuration
 from t6gps.service import provenance
@@ -84,15 +84,14 @@ def commit(
     return evaluations.commit(run, row, (read(file) for file in episodes.files()))
 
 
-def world(run: Run, evaluation_id: int) -> Config:
-    """The configuration of an evaluation. DataError naming those that the run keeps."""
-    found = tables.read(run, "evaluations", ["settings"], pc.field("evaluation_id") == evaluation_id).to_pylist()
-    if not found:
-        known = tables.read(run, "evaluations", ["evaluation_id"]).column("evaluation_id").to_pylist()
-        kept = ", ".join(map(str, known)) or "none"
-        raise DataError(f"run {run.name} keeps no evaluation {evaluation_id}; kept: {kept}")
-    settings = json.loads(found[0]["settings"])
-    return origin.configured(run, [f"{key}={json.dumps(value)}" for key, value in settings.items()])
+def world(run: Run, kept: pa.Table, evaluation_id: int) -> Config:
+    """The configuration of an evaluation, of those that the table `kept` has. DataError naming them."""
+    settings = {row["evaluation_id"]: row["settings"] for row in kept.to_pylist()}
+    if evaluation_id not in settings:
+        known = ", ".join(map(str, settings)) or "none"
+        raise DataError(f"run {run.name} keeps no evaluation {evaluation_id}; kept: {known}")
+    changed = json.loads(settings[evaluation_id])
+    return origin.configured(run, [f"{key}={json.dumps(value)}" for key, value in changed.items()])
 
 
 def _number(run: Run, occasion: Occasion, policy_version: int) -> int | None:

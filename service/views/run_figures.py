@@ -24,8 +24,8 @@ from t6gps.storage import durable, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
-from t6gps.workers.robot.symmetry import REFERENCE_FACE, REFERENCE_TRIANGLES_M
-from t6gps.workers.robot.topology import DELTA, FACES, LAMBDA
+from t6gps.workers.robot.symmetry import EDGE_NAMES, REFERENCE_FACE, REFERENCE_TRIANGLES_M
+from t6gps.workers.robot.topology import DELTA, FACES, KIND_NAMES, LAMBDA
 from t6gps.workers.settings import HALF_DIAMETER_M, RolloutSettings
 
 if TYPE_CHECKING:
@@ -65,8 +65,6 @@ CLASS_COLOURS: dict[ClassName, str] = {
     (LAMBDA, 0, 1): BLUE,
     (LAMBDA, 0, 2): SKY,
 }
-KINDS = ("Delta", "Lambda")
-EDGES = (("back", "left", "right"), ("virtual", "left", "right"))
 SPEED = "forward_speed_m_per_s"
 OTHER_TRACKS_N, PATHS_PER_CLASS_N = 15, 30
 TRACK_COLUMNS = ["episode_id", "step", "com_x_m", "com_y_m", "waypoint", "waypoint_x_m", "waypoint_y_m"]
@@ -227,14 +225,14 @@ def _paths(frames: pa.Table) -> tuple[list[int], list[ClassName], list[Array]]:
 def _triangle(axes: Axes, kind: int) -> None:
     corners = REFERENCE_TRIANGLES_M[kind]
     axes.add_patch(Polygon(corners, facecolor="#F3F3F3", edgecolor="none", zorder=0))
-    for edge, name in enumerate(EDGES[kind]):
+    for edge, name in enumerate(EDGE_NAMES[kind]):
         ends = corners[[edge, (edge + 1) % 3]]
         dashed = kind == LAMBDA and edge == 0
         axes.plot(*ends.T, color=DARK, linewidth=1.6, linestyle="--" if dashed else "-", zorder=4)
         place = ends.mean(axis=0) * 1.28
         turn = 90 if edge == 0 else (-30 if edge == 1 else 30)
         axes.annotate(name, tuple(place), ha="center", va="center", rotation=turn, color=DARK, fontsize=9)
-    axes.set(title=f"{KINDS[kind]} segments", xlabel="forward (m)", ylabel="left (m)", aspect="equal")
+    axes.set(title=f"{KIND_NAMES[kind]} segments", xlabel="forward (m)", ylabel="left (m)", aspect="equal")
     axes.set(xlim=(-0.75, 0.95), ylim=(-0.85, 0.85))
 
 
@@ -274,5 +272,5 @@ def _class_sizes(axes: Axes, classes: pa.Table) -> None:
 def _class_label(key: ClassName) -> str:
     kind, entry, exit_ = key
     if entry is None or exit_ is None:
-        return f"{KINDS[kind]}  partial or cut"
-    return f"{KINDS[kind]}  {EDGES[kind][entry]} → {EDGES[kind][exit_]}"
+        return f"{KIND_NAMES[kind]}  partial or cut"
+    return f"{KIND_NAMES[kind]}  {EDGE_NAMES[kind][entry]} → {EDGE_NAMES[kind][exit_]}"

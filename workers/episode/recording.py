@@ -227,10 +227,12 @@ def stuck_share_by_distance(com: Array) -> float | None:
 
     A robot that rocks on the spot has speed but gets nowhere.
     """
-    if len(com) <= STUCK_STEPS:
-        return None
-    distance = np.linalg.norm(com[STUCK_STEPS:] - com[:-STUCK_STEPS], axis=1)
-    return float((distance < STUCK_DISTANCE_M).mean())
+    return None if len(com) <= STUCK_STEPS else float(stuck_by_distance(com).mean())
+
+
+def stuck_by_distance(com: Array) -> NDArray[np.bool_]:
+    """Whether places 10 .. T of [T + 1, 3] (m) are less than 0.05 m from the one 1 s before."""
+    return np.asarray(np.linalg.norm(com[STUCK_STEPS:] - com[:-STUCK_STEPS], axis=1) < STUCK_DISTANCE_M)
 
 
 def _stacked(rows: Sequence[NDArray[Scalar]]) -> NDArray[Scalar]:

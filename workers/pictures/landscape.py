@@ -45,8 +45,7 @@ class Landscape:
         self.creases = _creases(terrain)
         if terrain is None:
             return
-        share = np.linspace(0, len(TINTS) - 1, 256)
-        self._tints = np.stack([np.interp(share, np.arange(len(TINTS)), t) for t in TINTS.T], axis=1).astype(np.float32)
+        self._tints = tint(np.linspace(LOWEST_M, HIGHEST_M, 256)).astype(np.float32)
         vertices, faces = terrain.triangles()
         corners = vertices[faces]
         normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
@@ -97,6 +96,12 @@ class Landscape:
         albedo = self._tints.take(shade, axis=0) * (1 - 0.30 * _line(gap, pixel))[:, None]
         sunlit, sky = look_up((self._sunlit, self._open_sky), u * (cell / FINE_M), v * (cell / FINE_M))
         return self._lambert.take(facet) * sunlit, self._skyward.take(facet) * sky, albedo
+
+
+def tint(height_m: Array) -> Array:
+    """Albedo of ground at such heights [..., 3], in linear light."""
+    share = np.clip((height_m - LOWEST_M) / (HIGHEST_M - LOWEST_M), 0, 1) * (len(TINTS) - 1)
+    return np.stack([np.interp(share, np.arange(len(TINTS)), colour) for colour in TINTS.T], axis=-1)
 
 
 def _creases(terrain: Terrain | None) -> Array:

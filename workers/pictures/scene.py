@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from t6gps.storage import schema
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures.landscape import Landscape
+from t6gps.workers.pictures.motion import numbers
 from t6gps.workers.pictures.raycast import Camera
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.topology import BARS, BARS_N, CABLES, CABLES_N
@@ -119,7 +120,7 @@ class Scene:
 
     def rods(self, step: int) -> Rods:
         """Bars with their caps, cables, the waypoint's flag, and the track of the centre of mass."""
-        nodes, track = self.nodes[step], self._track(step)
+        nodes, track = self.nodes[step], laid(self.com[: step + 1, :2], self.landscape.height)
         first, second = nodes[BARS].swapaxes(0, 1)
         ends = np.concatenate([first, second])
         inward = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True) * CAP_LENGTH_M
@@ -142,32 +143,31 @@ class Scene:
             np.concatenate([np.full(len(a), part) for a, _, _, part in pieces]),
         )
 
-    def _track(self, step: int) -> Array:
-        """Path of the centre of mass up to now, laid on the ground [k, 3] (m)."""
-        path = self.com[: step + 1, :2]
-        length = np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T).cumsum()])
-        places = np.linspace(0, length[-1], int(length[-1] / 0.08) + 2)
-        x, y = (np.interp(places, length, path[:, i]) for i in range(2))
-        return np.column_stack([x, y, self.landscape.height(x, y) + 0.01])
+
+def laid(path: Array, height: Callable[[Array, Array], Array]) -> Array:
+    """A horizontal path [n, 2] laid on the ground of such heights, close enough to follow its facets [k, 3] (m)."""
+    length = np.concatenate([[0.0], np.hypot(*np.diff(path, axis=0).T).cumsum()])
+    places = np.linspace(0, length[-1], int(length[-1] / 0.08) + 2)
+    x, y = (np.interp(places, length, path[:, i]) for i in range(2))
+    return np.column_stack([x, y, height(x, y) + 0.01])
 
 
 def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], sizes: Sizes = USUAL) -> Scene:
     """The scene of an episode's `frames` on its ground (None: flat), seen from where the rows `steps` are seen best."""
     positions, orientations = (
-        np.asarray(schema.array(frames, name), dtype=np.float64).reshape(-1, BARS_N, n)
-        for name, n in (("bar_positions", 3), ("bar_orientations", 4))
+        numbers(frames, name).reshape(-1, BARS_N, n) for name, n in (("bar_positions", 3), ("bar_orientations", 4))
     )
     rest = np.zeros_like(positions)
     state = RobotState.of(positions, orientations, rest, rest, np.zeros((len(rest), CABLES_N)))
-    com, nodes, time_s = state.com, state.nodes(), _numbers(frames, "time_s")
-    waypoint = np.column_stack([_numbers(frames, "waypoint_x_m"), _numbers(frames, "waypoint_y_m")])
+    com, nodes, time_s = state.com, state.nodes(), numbers(frames, "time_s")
+    waypoint = np.column_stack([numbers(frames, "waypoint_x_m"), numbers(frames, "waypoint_y_m")])
     weights = np.exp(-0.5 * ((time_s[:, None] - time_s) / SMOOTHING_S) ** 2)
     path = weights @ com / weights.sum(axis=1, keepdims=True)
     rows = np.unique(np.asarray(steps)[:: max(1, len(steps) // 30)])
-    angle = _view_angle(path[rows], nodes[rows], waypoint[rows] - com[rows, :2], terrain)
+    angle = view_angle(path[rows], nodes[rows], waypoint[rows] - com[rows, :2], terrain)
     sun = np.array([*np.cos(SUN_ELEVATION_RAD) * _unit(angle + SUN_TURN_RAD), np.sin(SUN_ELEVATION_RAD)])
     landscape = Landscape(terrain, sun)
-    eyes = _eyes(path, angle)
+    eyes = eyes_at(path, angle)
     eyes[:, 2] = np.maximum(eyes[:, 2], landscape.height(eyes[:, 0], eyes[:, 1]) + 1.0)
     return Scene(
         landscape=landscape,
@@ -180,24 +180,21 @@ def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], sizes
         kind=np.asarray(schema.array(frames, "kind"), dtype=np.int64),
         waypoint=waypoint,
         time_s=time_s,
-        forward_speed_m_per_s=_numbers(frames, "forward_speed_m_per_s"),
+        forward_speed_m_per_s=numbers(frames, "forward_speed_m_per_s"),
         sizes=sizes,
     )
-
-
-def _numbers(frames: pa.Table, name: str) -> Array:
-    return np.asarray(schema.array(frames, name), dtype=np.float64)
 
 
 def _unit(angle_rad: float) -> Array:
     return np.array([np.cos(angle_rad), np.sin(angle_rad)])
 
 
-def _eyes(path: Array, angle_rad: float) -> Array:
+def eyes_at(path: Array, angle_rad: float) -> Array:
+    """Where the camera stands to look in a direction at places [..., 3] (m)."""
     return path + DISTANCE_M * np.array([*-np.cos(ELEVATION_RAD) * _unit(angle_rad), np.sin(ELEVATION_RAD)])
 
 
-def _view_angle(path: Array, nodes: Array, way: Array, terrain: Terrain | None) -> float:
+def view_angle(path: Array, nodes: Array, way: Array, terrain: Terrain | None) -> float:
     """Direction of view (rad) in which hills hide the least of the robot, by preference along the way."""
     mean_way = (way / np.linalg.norm(way, axis=1, keepdims=True).clip(1e-9)).sum(axis=0)
     preferred = float(np.arctan2(mean_way[1], mean_way[0]) + WAYPOINT_TURN_RAD)
@@ -207,7 +204,7 @@ def _view_angle(path: Array, nodes: Array, way: Array, terrain: Terrain | None) 
     share = np.linspace(0.02, 0.5, 24)[:, None]
     penalties = []
     for angle in angles:
-        eyes = _eyes(path, angle)[:, None, None]
+        eyes = eyes_at(path, angle)[:, None, None]
         sight = nodes[:, :, None] + share * (eyes - nodes[:, :, None])
         hidden = (terrain.height(sight[..., 0], sight[..., 1]) > sight[..., 2]).any(axis=-1)
         penalties.append(hidden.mean() + 0.1 * (1 - np.cos(angle - preferred)))

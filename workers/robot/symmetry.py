@@ -87,6 +87,9 @@ BARS_FROM = np.argsort(BAR_MAP, axis=1)
 CABLES_FROM = np.argsort(CABLE_MAP, axis=1)
 """Inverse map of cables [24, 24]."""
 
+EDGE_NAMES = (("back", "left", "right"), ("virtual", "left", "right"))
+"""Of the canonical edges of each kind of triangle."""
+
 REFERENCE_FACE = np.array([int(np.flatnonzero(kind == FACE_KINDS)[0]) for kind in (DELTA, LAMBDA)])
 """Reference face of each kind [2]."""
 

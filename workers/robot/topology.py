@@ -26,6 +26,8 @@ DELTA = 0
 LAMBDA = 1
 """Kind of an open face."""
 
+KIND_NAMES = ("Delta", "Lambda")
+
 
 def _neutral_nodes() -> NDArray[np.float64]:
     quarter, half = BAR_LENGTH_M / 4, BAR_LENGTH_M / 2

@@ -18,6 +18,7 @@ from t6gps.service.views.diagnosis import diagnose
 from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
+from t6gps.workers.robot.topology import KIND_NAMES
 
 
 def add_to(app: typer.Typer) -> None:
@@ -63,7 +64,7 @@ def show(run_name: RunName, root: Root = DEFAULT_ROOT, server: Server = None) ->
         classes, result = there.table(run_name, "classes").to_pylist(), there.evaluation(run_name)
     terminal.print_rows(f"Run {run_name}", iterations, terminal.LEARNING_COLUMNS)
     last = max((row["iteration"] for row in classes), default=-1)
-    rows = [row | {"kind": ("Delta", "Lambda")[row["kind"]]} for row in classes if row["iteration"] == last]
+    rows = [row | {"kind": KIND_NAMES[row["kind"]]} for row in classes if row["iteration"] == last]
     terminal.print_rows(f"Segment classes of iteration {last}", rows, terminal.CLASS_COLUMNS)
     typer.echo("\n".join(["Diagnosis:", *(f"  {sentence}" for sentence in diagnose(iterations, classes)), ""]))
     if result:

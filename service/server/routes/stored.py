@@ -126,11 +126,16 @@ def _warned(warnings: Sequence[str]) -> dict[str, str]:
 @routes.get(
     "/{name}/episodes/{number}", response_class=Response, responses=contents([MEDIA[QueryForm.ARROW]], "An IPC stream.")
 )
-def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], place: Place) -> Response:
-    """The frames of an episode, bit for bit."""
+def episode(
+    run: NamedRun,
+    number: Annotated[int, Path(ge=0, le=NUMBER_MOST)],
+    place: Place,
+    evaluation: Annotated[int | None, Query(ge=0, le=NUMBER_MOST)] = None,
+) -> Response:
+    """The frames of an episode of training, or of an evaluation, bit for bit."""
     sink = io.BytesIO()
     with place.reading.taken():
-        frames = tables.episode(run, number).frames
+        frames = tables.episode(run, number, evaluation).frames
     with pa.ipc.new_stream(sink, frames.schema) as writer:
         writer.write_table(frames)
     return Response(sink.getvalue(), media_type=MEDIA[QueryForm.ARROW])

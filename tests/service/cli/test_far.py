@@ -71,7 +71,21 @@ REFUSALS = {
     "events": [["none"]],
     "logs": [["none"], ["paused"]],
     "eval": [["none", "--serial"], ["paused", "--serial"], ["tiny", "--set", "learner.epochs=1"]],
-    "render": [["tiny", "99", "--out", "x.png"], ["none", "0", "--out", "x.png"], ["tiny", "0", "--out", "x.gif"]],
+    "render": [
+        ["tiny", "99", "--out", "x.png"],
+        ["none", "0", "--out", "x.png"],
+        ["tiny", "0", "--out", "x.gif"],
+        ["tiny", "0", "--evaluation", "7", "--out", "x.png"],
+        ["tiny", "99", "--evaluation", "0", "--out", "x.png"],
+    ],
+    "view": [
+        ["tiny", "99", "--out", "x.rrd"],
+        ["none", "0", "--out", "x.rrd"],
+        ["tiny", "--out", "x.rrd"],
+        ["tiny", "--pick", "best:99", "--out", "x.rrd"],
+        ["tiny", "--pick", "best:3", "--evaluation", "0", "--out", "x.rrd"],
+        ["tiny", "0", "--evaluation", "7", "--out", "x.rrd"],
+    ],
     "fetch": [["none"], ["tiny", "--run", "../up"]],
     "scale": [["paused", "2"], ["none", "2"], ["tiny", "2"]],
     "pause": [["paused"], ["none"]],
@@ -161,9 +175,35 @@ def test_pictures_and_runs_come_home_with_the_same_bytes(
     root, url = place
     for name, where in (("here", ["--root", str(root)]), ("far", ["--server", url])):
         t6gps("render", "tiny", "1", "--step", "3", "--out", tmp_path / f"{name}.png", *where)
+        t6gps("view", "tiny", "--pick", "best:2", "--evaluation", "0", "--out", tmp_path / f"{name}-rrd", *where)
         t6gps("fetch", "tiny", "--to", tmp_path / name, *where)
         assert run_digest.digests(tmp_path / name / "tiny") == tiny.digests
     assert (tmp_path / "here.png").read_bytes() == (tmp_path / "far.png").read_bytes()
+    here, far = ({path.name for path in (tmp_path / f"{name}-rrd").iterdir()} for name in ("here", "far"))
+    assert here == far == {"tiny-evaluation-0-0.rrd", "tiny-evaluation-0-1.rrd"}
+
+
+@pytest.mark.parametrize("evaluation", [None, 0])
+def test_an_episode_is_the_same_through_a_server(place: tuple[Path, str], evaluation: int | None) -> None:
+    root, url = place
+    stored = []
+    for server in (None, url):
+        with door.opened(root, server) as there:
+            stored.append(there.episode("tiny", 1, evaluation))
+    here, far = stored
+    assert far.frames.equals(here.frames, check_metadata=True)
+    assert far.summary.to_pylist() == here.summary.to_pylist()
+
+
+@pytest.mark.parametrize("table", ["evaluations", "evaluation_episodes"])
+def test_tables_of_evaluations_are_the_same_through_a_server(place: tuple[Path, str], table: str) -> None:
+    root, url = place
+    rows = []
+    for server in (None, url):
+        with door.opened(root, server) as there:
+            rows.append(there.table("tiny", table).to_pylist())
+    assert rows[0] == rows[1]
+    assert rows[0]
 
 
 def test_events_are_followed_alike_here_and_through_a_server(place: tuple[Path, str]) -> None:

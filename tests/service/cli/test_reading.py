@@ -66,6 +66,7 @@ def test_a_damaged_run_is_listed_with_the_reason_and_the_others_as_ever(damage: 
         ("show", "tiny"),
         ("query", "tiny", "SELECT count(*) FROM frames"),
         ("render", "tiny", "1", "--out", "still.png"),
+        ("view", "tiny", "1", "--out", "episode.rrd"),
         ("eval", "tiny", "--episodes", "2", "--serial"),
     ],
     ids=lambda command: command[0],
@@ -77,6 +78,7 @@ def test_a_damaged_run_is_one_clear_error_of_whoever_needs_what_is_damaged(
         "show": set[str](),
         "query": {"unreadable configuration", "missing configuration", "missing ground", "missing table"},
         "render": {"missing table"},
+        "view": {"missing table"},
         "eval": {"gap in a log", "missing table"},
     }
     needed = DAMAGES.keys() - spared[command[0]]
@@ -129,6 +131,7 @@ def test_reading_needs_no_permission_to_write(root: Path, tmp_path: Path) -> Non
         assert "STOPPED" in t6gps("status", "tiny", "--root", root).stdout.decode()
         t6gps("query", "tiny", "SELECT count(*) FROM frames", "--root", root)
         t6gps("render", "tiny", "0", "--out", tmp_path / "still.png", "--root", root)
+        t6gps("view", "tiny", "0", "--out", tmp_path / "episode.rrd", "--root", root)
         t6gps("eval", "tiny", "--episodes", "2", "--serial", "--no-keep", "--root", root)
         keeps = t6gps("eval", "tiny", "--episodes", "2", "--serial", "--root", root, code=2)
         assert "cannot keep an evaluation" in keeps.stderr

@@ -88,6 +88,7 @@ def test_a_run_is_trained_resumed_evaluated_and_drawn_without_the_file_of_its_gr
     assert "warning" not in t6gps(*resume, "--root", root, *settings).stderr
     t6gps("eval", "one", "--episodes", "2", "--serial", "--root", root)
     t6gps("render", "one", "0", "--out", tmp_path / "still.png", "--root", root)
+    t6gps("view", "one", "0", "--out", tmp_path / "episode.rrd", "--root", root)
 
 
 def test_a_file_is_the_same_ground_by_its_content(run: Run, config: Config, file: Path, tmp_path: Path) -> None:
