@@ -12,8 +12,8 @@ import json
 import mmap
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import BinaryIO
 
@@ -81,7 +81,7 @@ def query(question: Question) -> pa.Table:
     one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of
     1 GB or the question's seconds.
     """
-    with _answer(question, "arrow") as result:
+    with answer(question, "arrow") as result:
         return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
 
 
@@ -90,23 +90,23 @@ def write(question: Question, form: str, sink: BinaryIO) -> None:
 
     Its size is that of a file, not of memory. Raises errors as `query` does; nothing is written then.
     """
-    with _answer(question, form) as result:
+    with answer(question, form) as result:
         shutil.copyfileobj(result, sink)
     sink.flush()
 
 
 def head(question: Question) -> Head:
     """The first rows of what `query` would return. Raises errors as `query` does; the result has no bound."""
-    with _answer(question, "head") as result:
+    with answer(question, "head") as result:
         return Head(**json.load(result))
 
 
-@contextmanager
-def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
-    """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
+def answer(question: Question, form: str) -> BinaryIO:
+    """A file with what `write` would write, at its start. Whoever asked closes it. Raises errors as `query` does."""
     check_size(question.sql)
     files, about = read(question)
-    with tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as result, tempfile.TemporaryFile() as words:
+    with ExitStack() as stack, tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as words:
+        result = stack.enter_context(tempfile.TemporaryFile())
         asked.write(_line(question, form, files) + _stream(about))
         asked.seek(0)
         status = warm.running().answered(asked, result, words, question.timeout_s)
@@ -122,7 +122,8 @@ def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
                 raise damaged(question.runs, files, *json.loads(message))
             raise QueryError(_reason(status, message))
         result.seek(0)
-        yield result
+        stack.pop_all()  # it stays open
+        return result
 
 
 def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
