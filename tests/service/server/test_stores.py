@@ -6,6 +6,7 @@ import pickle
 import time
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import ExitStack
 from dataclasses import replace
 
 import numpy as np
@@ -16,7 +17,7 @@ from starlette.exceptions import HTTPException
 import t6gps
 from t6gps.service.remote.messages import Scope
 from t6gps.service.server.guard import utc_now
-from t6gps.service.server.routes.access import ASKING_OF_TOKEN_N, Shares
+from t6gps.service.server.routes.access import ANSWERS_OF_TOKEN_N, ASKING_OF_TOKEN_N, Shares
 from t6gps.service.server.tokens import Token
 from t6gps.storage.errors import DataError, ServerError
 
@@ -106,6 +107,19 @@ def test_a_token_takes_no_more_than_its_share() -> None:
             assert allowed
     shares.give_back(one)
     shares.take(third)
+
+
+def test_results_that_are_not_taken_are_few_and_make_room_when_their_reader_goes(
+    server: Server, wait_until: Callable[..., None]
+) -> None:
+    large = {"runs": "walk", "sql": "SELECT range FROM range(3000000)"}
+    with server.http(Scope.READ) as http, ExitStack() as readers:
+        for _ in range(ANSWERS_OF_TOKEN_N):
+            answer = readers.enter_context(http.stream("POST", "/v1/query", json=large))
+            assert answer.status_code == 200
+        assert http.post("/v1/query", json=large).status_code == 503
+        readers.close()
+        wait_until(lambda: http.post("/v1/query", json={**large, "sql": "SELECT 1"}).status_code == 200, 30)
 
 
 @pytest.mark.slow
