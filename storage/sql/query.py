@@ -19,7 +19,7 @@ from typing import BinaryIO
 
 import pyarrow as pa
 
-from t6gps.storage import schema, tables
+from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
@@ -127,11 +127,12 @@ def answer(question: Question, form: str) -> BinaryIO:
 
 
 def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
-    """Of each table the files that the question may read, by run; and the table `runs`."""
-    named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
-    of_files, rows = named - {"runs"}, []
+    """Of each table that the question may read the files, by run; and the table `runs`."""
+    named, rows = views.read_by(question.sql), []
+    of_files = named - {"runs"}
     if of_files:
         of_files.add("frames")  # which is committed first, and so shows what `episodes` has lost
+    files = {table: RunFiles() for table in of_files}
     for run in question.runs:
         try:
             found = tables.files(run, of_files) if of_files else {}
@@ -145,7 +146,8 @@ def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
             files[table][run.name] = of_run
         if row is not None:
             rows.append(row)
-    return files, pa.Table.from_pylist(rows, question.about.columns)
+    columns = question.about.columns
+    return files, pa.Table.from_pylist(rows, columns) if rows else columns.empty_table()
 
 
 def _line(question: Question, form: str, files: Mapping[str, RunFiles]) -> bytes:
