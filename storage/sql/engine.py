@@ -8,6 +8,7 @@ from typing import TypeAlias, final
 import duckdb
 import pyarrow as pa
 
+from t6gps.storage import schema
 from t6gps.storage.delta import parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import QueryError
@@ -34,15 +35,19 @@ class Engine:
     def __init__(self, settings: Mapping[str, int | str]) -> None:
         self._connection = duckdb.connect(":memory:", config=dict(settings))
         self._shown: dict[str, RunFiles] = {}
+        self._runs: pa.Table | None = None
 
     def show(self, files: Mapping[str, RunFiles], runs: pa.Table) -> None:
-        """Let it see the files of every table, by run, and the table `runs`."""
+        """Let it see the files of tables, by run, and the table `runs`. Tables that are not named stay as they are."""
         first = not self._shown
-        for table, of_runs in files.items():
+        for table in schema.TABLES:
+            of_runs = files.get(table, self._shown.get(table, {}))
             if self._shown.get(table) != of_runs:
                 self._connection.register(table, parquet.rows_of_runs(table, of_runs))
                 self._shown[table] = of_runs
-        self._connection.register("runs", runs)
+        if first or not runs.equals(self._runs):
+            self._connection.register("runs", runs)
+            self._runs = runs
         if first:
             self._connection.register("columns", views.described(views.asked(runs.schema)))
             for name, view in views.VIEWS.items():

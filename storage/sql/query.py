@@ -12,14 +12,14 @@ import json
 import mmap
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
 from typing import BinaryIO
 
 import pyarrow as pa
 
-from t6gps.storage import schema, tables
+from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
@@ -81,7 +81,7 @@ def query(question: Question) -> pa.Table:
     one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of
     1 GB or the question's seconds.
     """
-    with _answer(question, "arrow") as result:
+    with answer(question, "arrow") as result:
         return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
 
 
@@ -90,23 +90,23 @@ def write(question: Question, form: str, sink: BinaryIO) -> None:
 
     Its size is that of a file, not of memory. Raises errors as `query` does; nothing is written then.
     """
-    with _answer(question, form) as result:
+    with answer(question, form) as result:
         shutil.copyfileobj(result, sink)
     sink.flush()
 
 
 def head(question: Question) -> Head:
     """The first rows of what `query` would return. Raises errors as `query` does; the result has no bound."""
-    with _answer(question, "head") as result:
+    with answer(question, "head") as result:
         return Head(**json.load(result))
 
 
-@contextmanager
-def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
-    """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
+def answer(question: Question, form: str) -> BinaryIO:
+    """A file with what `write` would write, at its start. Whoever asked closes it. Raises errors as `query` does."""
     check_size(question.sql)
     files, about = read(question)
-    with tempfile.TemporaryFile() as result:
+    with ExitStack() as stack:
+        result = stack.enter_context(tempfile.TemporaryFile())
         status, words = _asked(question, form, files, about, result)
         if status == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
             files, about = read(question)
@@ -118,7 +118,8 @@ def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
         if status:
             raise QueryError(_reason(status, words))
         result.seek(0)
-        yield result
+        stack.pop_all()  # it stays open
+        return result
 
 
 def _asked(
@@ -139,10 +140,11 @@ def _asked(
 
 
 def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
-    """Of each table the files that the question may read, by run; and the table `runs`."""
-    named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
-    of_files, rows = named - {"runs"}, []
+    """Of each table that the question may read the files, by run; and the table `runs`."""
+    named, rows = views.read_by(question.sql), []
+    of_files = named - {"runs"}
     checked = of_files | {"frames"} if of_files else set()  # committed first, it shows what `episodes` has lost
+    files = {table: RunFiles() for table in of_files}
     read = cache.files if len(question.runs) > 1 else tables.files
     for run in question.runs:
         try:
@@ -157,7 +159,8 @@ def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
             files[table][run.name] = found[table]
         if row is not None:
             rows.append(row)
-    return files, pa.Table.from_pylist(rows, question.about.columns)
+    columns = question.about.columns
+    return files, pa.Table.from_pylist(rows, columns) if rows else columns.empty_table()
 
 
 def _line(question: Question, form: str, files: Mapping[str, RunFiles]) -> bytes:
