@@ -16,7 +16,7 @@ from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode, PolicySnapshot
 
-KNOWN_RUNS_N, KNOWN_SUMMARIES_N = 2048, 16
+KNOWN_RUNS_N, KNOWN_SUMMARIES_N = 1024, 16
 """Runs whose files are remembered until they change, and tables of episodes."""
 
 
