@@ -47,8 +47,10 @@ def opened(run: Run, table: str) -> DeltaTable | None:
         return DeltaTable(location, storage_options=options) if there else None
 
 
-def state(run: Run) -> tuple[tuple[int, ...], ...]:
+def state(run: Run) -> tuple[tuple[int | str, ...], ...]:
     """What differs after every commit, and after a file of a table has come, gone, or got another size."""
+    if place.is_object(run.path):
+        return tuple(place.below(run.tables).items())
     return tuple(_state(run.tables / name) for name in schema.TABLES)
 
 

@@ -5,7 +5,6 @@ Files never change once they are committed, so that what was learned of one hold
 
 from __future__ import annotations
 
-import os
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
@@ -15,6 +14,7 @@ import pyarrow.parquet as pq
 
 from t6gps.storage import schema
 from t6gps.storage.delta.parquet import Files
+from t6gps.storage.objects import place
 
 KNOWN_FILES_N = 4096
 
@@ -33,8 +33,9 @@ def groups(files: Files) -> list[Group]:
     """The row groups of files, in their order. ArrowException or OSError where one is torn."""
     found = list[Group]()
     for path in files.paths:
-        status = os.stat(path)  # noqa: PTH116 # it is asked of every file, each time
-        found.extend(_groups(path, status.st_size, status.st_mtime_ns))
+        file_system, (inner,) = place.located([path])
+        status = file_system.get_file_info(inner)
+        found.extend(_groups(path, status.size, status.mtime_ns))
     return found
 
 
@@ -44,7 +45,8 @@ def read(table: str, group: Group, columns: Sequence[str]) -> pa.Table:
     ArrowException or OSError where the file is torn, or a page differs from its checksum.
     """
     wanted = pa.schema([schema.TABLES[table].field(name) for name in columns])
-    with pq.ParquetFile(group.path, page_checksum_verification=True) as file:
+    file_system, (inner,) = place.located([group.path])
+    with pq.ParquetFile(inner, filesystem=file_system, page_checksum_verification=True) as file:
         there = frozenset(file.schema_arrow.names)
         known = [name for name in columns if name in there]
         rows = file.read_row_group(group.number, known, use_threads=False)
@@ -58,15 +60,18 @@ def read(table: str, group: Group, columns: Sequence[str]) -> pa.Table:
 
 
 @lru_cache(KNOWN_FILES_N)
-def _groups(path: str, size_n: int, changed_ns: int) -> tuple[Group, ...]:
-    with pq.ParquetFile(path) as file:
-        place = file.schema_arrow.names.index("episode_id")
-        return tuple(Group(path, number, *_ends(file, number, place)) for number in range(file.metadata.num_row_groups))
+def _groups(path: str, size_n: int | None, changed_ns: int | None) -> tuple[Group, ...]:
+    file_system, (inner,) = place.located([path])
+    with pq.ParquetFile(inner, filesystem=file_system) as file:
+        column = file.schema_arrow.names.index("episode_id")
+        return tuple(
+            Group(path, number, *_ends(file, number, column)) for number in range(file.metadata.num_row_groups)
+        )
 
 
-def _ends(file: pq.ParquetFile, number: int, place: int) -> tuple[int, int]:
+def _ends(file: pq.ParquetFile, number: int, column: int) -> tuple[int, int]:
     """The least and greatest episode of a row group: a file that another program wrote may not say them."""
-    statistics = file.metadata.row_group(number).column(place).statistics
+    statistics = file.metadata.row_group(number).column(column).statistics
     if statistics is not None and statistics.has_min_max:
         return int(statistics.min), int(statistics.max)
     numbers = file.read_row_group(number, ["episode_id"]).column(0).to_numpy()

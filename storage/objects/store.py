@@ -34,6 +34,8 @@ RETRIES_N, RETRY_S = 2, 10
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"status code: (\d{3})|HTTP status (\d{3})")
+PREFIX = "AWS_"
+"""Of the variables that say how the store is reached."""
 _KEYS = ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY")
 
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import io
 import json
 import mmap
+import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -24,6 +25,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import DataError, QueryError, StoreError, T6GpsError
+from t6gps.storage.objects import store
 from t6gps.storage.sql import cache, sandbox, views, warm
 from t6gps.storage.sql.engine import RunFiles
 
@@ -170,6 +172,7 @@ def _line(question: Question, form: str, files: Mapping[str, RunFiles]) -> bytes
         "form": form,
         "files": {table: {run: asdict(found) for run, found in of_runs.items()} for table, of_runs in files.items()},
         "timeout_s": question.timeout_s,
+        "environment": {name: value for name, value in os.environ.items() if name.startswith(store.PREFIX)},
     }
     return json.dumps(sent).encode() + b"\n"
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import errno
 import json
 import math
+import os
 import re
 import resource
 import signal
@@ -62,6 +63,7 @@ def answer() -> int:
     pa.set_cpu_count(_THREADS_N)
     pa.set_io_thread_count(_THREADS_N)
     question, runs = _asked()
+    os.environ.update(question["environment"])
     try:
         with open(1, "wb", closefd=False) as result:  # its last bytes may not fit either
             formats.write(_relation(question, runs), question["form"], result)
