@@ -11,6 +11,8 @@ if TYPE_CHECKING:
     from t6gps.service.api.training import Progress, evaluate, train
     from t6gps.service.config import presets
     from t6gps.service.steering.status import Status
+    from t6gps.service.stores.opening import open_store
+    from t6gps.service.stores.store import Store
     from t6gps.service.training.evaluation import Evaluation
     from t6gps.storage.errors import ConfigError, QueryError, RunError, T6GpsError
 
@@ -26,6 +28,8 @@ else:
         "train": "t6gps.service.api.training",
         "presets": "t6gps.service.config",
         "Status": "t6gps.service.steering.status",
+        "open_store": "t6gps.service.stores.opening",
+        "Store": "t6gps.service.stores.store",
         "Evaluation": "t6gps.service.training.evaluation",
         "ConfigError": "t6gps.storage.errors",
         "QueryError": "t6gps.storage.errors",
@@ -60,10 +64,12 @@ __all__ = [
     "Run",
     "RunError",
     "Status",
+    "Store",
     "T6GpsError",
     "__version__",
     "evaluate",
     "open_run",
+    "open_store",
     "presets",
     "runs",
     "train",

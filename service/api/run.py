@@ -21,7 +21,7 @@ from t6gps.service.steering.status import Status
 from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.storage import catalog, tables
-from t6gps.storage.sql.query import query
+from t6gps.storage.sql import inprocess
 
 
 @final
@@ -52,9 +52,9 @@ class Run:
     def query(self, sql: str, /, **parameters: Parameter) -> pa.Table:
         """The result of one SELECT over its tables (docs/queries.md), with values for the SQL's $names.
 
-        Only committed iterations are seen. QueryError for SQL that is refused, wrong, or takes too much.
+        Only committed iterations are seen. QueryError for SQL that is refused or wrong.
         """
-        return query(asking.of_run(self._folder, sql, parameters))
+        return inprocess.ask(asking.of_run(self._folder, sql, parameters))
 
     def table(self, name: str, columns: list[str] | None = None, where: pc.Expression | None = None) -> pa.Table:
         """The committed rows of a table, bit for bit; units are in the metadata of its fields.

@@ -7,11 +7,11 @@ from __future__ import annotations
 
 import io
 import os
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 from types import TracebackType
 from typing import BinaryIO, final
-from urllib.parse import quote
+from urllib.parse import quote, urlencode
 
 import httpx
 import numpy as np
@@ -56,8 +56,8 @@ class Client:
 
     def __init__(self, url: str, token: str | None = None, transport: httpx.BaseTransport | None = None) -> None:
         token = os.environ.get(TOKEN_VARIABLE, "") if token is None else token
-        self._server = Connection(url, token.strip(), transport)
-        self.admin = Administration(self._server)
+        self.server = Connection(url, token.strip(), transport)
+        self.admin = Administration(self.server)
 
     def __enter__(self) -> Client:
         return self
@@ -69,15 +69,15 @@ class Client:
 
     def close(self) -> None:
         """Close its connections."""
-        self._server.close()
+        self.server.close()
 
     def health(self) -> Health:
         """The server's version."""
-        return self._server.get("/health", Health)
+        return self.server.get("/health", Health)
 
     def runs(self) -> list[RunSummary]:
         """All runs by name, damaged ones included."""
-        return self._server.get("/runs", list[RunSummary])
+        return self.server.get("/runs", list[RunSummary])
 
     def start(
         self,
@@ -93,86 +93,86 @@ class Client:
         known = source in configuration.presets()
         text = {"preset": source} if known else {"toml": configuration.load(source).to_toml()}
         more = {"default_name": Path(source).stem, "settings": dict(settings or {}), "resume": resume}
-        return self._server.post("/runs", Started, checked(StartRequest, **text, name=name, **more))
+        return self.server.post("/runs", Started, checked(StartRequest, **text, name=name, **more))
 
     def status(self, name: str) -> Status:
         """How a run is."""
-        return self._server.get(f"{_run(name)}/status", Status)
+        return self.server.get(f"{_run(name)}/status", Status)
 
     def standing(self, name: str) -> Standing:
         """How a run is, and the job that trains it."""
-        return self._server.get(f"{_run(name)}/standing", Standing)
+        return self.server.get(f"{_run(name)}/standing", Standing)
 
     def jobs(self) -> list[JobLine]:
         """The jobs that train runs of the server."""
-        return self._server.get("/jobs", list[JobLine])
+        return self.server.get("/jobs", list[JobLine])
 
     def log(self, name: str, after: int) -> bytes:
         """What the job of a run has written after so many bytes, a piece; nothing where that is all so far."""
-        return self._server.ask("GET", f"{_run(name)}/logs?after={after}")
+        return self.server.ask("GET", f"{_run(name)}/logs?after={after}")
 
     def history(self, name: str) -> list[Event]:
         """What happened to a run's workers and episodes, each with its reason."""
-        return self._server.get(f"{_run(name)}/history", list[Event])
+        return self.server.get(f"{_run(name)}/history", list[Event])
 
     def scale(self, name: str, workers: int, deadline_s: float = SCALE_DEADLINE_S) -> Status:
         """Give a running run so many workers, and wait until it has them; its status then."""
         request = checked(ScaleRequest, workers=workers, deadline_s=deadline_s)
-        return self._server.post(f"{_run(name)}/scale", Status, request)
+        return self.server.post(f"{_run(name)}/scale", Status, request)
 
     def pause(self, name: str, deadline_s: float = SCALE_DEADLINE_S) -> Status:
         """Take all workers from a running run; its status then."""
-        return self._server.post(f"{_run(name)}/pause", Status, checked(WaitRequest, deadline_s=deadline_s))
+        return self.server.post(f"{_run(name)}/pause", Status, checked(WaitRequest, deadline_s=deadline_s))
 
     def unpause(self, name: str, deadline_s: float = SCALE_DEADLINE_S) -> Status:
         """Give a paused run what it had; its status then."""
-        return self._server.post(f"{_run(name)}/unpause", Status, checked(WaitRequest, deadline_s=deadline_s))
+        return self.server.post(f"{_run(name)}/unpause", Status, checked(WaitRequest, deadline_s=deadline_s))
 
     def resume(self, name: str) -> Started:
         """Give a paused run its workers, or let a job train what is missing of a stopped run."""
-        return self._server.post(f"{_run(name)}/resume", Started)
+        return self.server.post(f"{_run(name)}/resume", Started)
 
     def stop(self, name: str, deadline_s: float = STOP_DEADLINE_S) -> Stopped:
         """Stop a run, and wait until it has ended; everything sampled is kept."""
-        return self._server.post(f"{_run(name)}/stop", Stopped, checked(StopRequest, deadline_s=deadline_s))
+        return self.server.post(f"{_run(name)}/stop", Stopped, checked(StopRequest, deadline_s=deadline_s))
 
     def metrics(self, name: str) -> list[Row]:
         """Rows of the table `iterations`."""
-        return self._server.get(f"{_run(name)}/metrics", list[Row])
+        return self.server.get(f"{_run(name)}/metrics", list[Row])
 
     def evaluation(self, name: str) -> Evaluation | None:
         """What the last policy did without noise; None before the training has ended."""
-        return self._server.get(f"{_run(name)}/evaluation", Evaluation | None)  # type: ignore[arg-type]
+        return self.server.get(f"{_run(name)}/evaluation", Evaluation | None)  # type: ignore[arg-type]
 
     def figures(self, name: str) -> list[str]:
         """Names of a run's figures."""
-        return self._server.get(f"{_run(name)}/figures", list[str])
+        return self.server.get(f"{_run(name)}/figures", list[str])
 
     def figure(self, name: str, figure: str) -> bytes:
         """A figure as PNG."""
-        return self._server.ask("GET", f"{_run(name)}/figures/{quote(figure, safe='')}")
+        return self.server.ask("GET", f"{_run(name)}/figures/{quote(figure, safe='')}")
 
     def versions(self, name: str) -> list[int]:
         """Versions of the policies that are kept."""
-        return self._server.get(f"{_run(name)}/policies", list[int])
+        return self.server.get(f"{_run(name)}/policies", list[int])
 
     def policy(self, name: str, version: int) -> Policy:
         """A policy that acts here."""
-        content = self._server.ask("GET", f"{_run(name)}/policies/{int(version)}")
+        content = self.server.ask("GET", f"{_run(name)}/policies/{int(version)}")
         try:
             return _policy(content, version)
         except (ValueError, KeyError, OSError) as error:
-            raise self._server.nonsense(error) from None
+            raise self.server.nonsense(error) from None
 
     def query(self, runs: str, sql: str, /, **parameters: Parameter) -> pa.Table:
         """The result of one SELECT over a run, or over those that match a pattern. RunError where one is damaged."""
         sink = io.BytesIO()
         self.write(runs, sql, QueryForm.ARROW, sink, parameters, _refuse)
-        return self._server.table(sink.getvalue())
+        return self.server.table(sink.getvalue())
 
-    def episode(self, name: str, number: int) -> pa.Table:
-        """The frames of an episode, bit for bit."""
-        return self._server.table(self._server.ask("GET", f"{_run(name)}/episodes/{int(number)}"))
+    def episode(self, name: str, number: int, columns: Sequence[str] = ()) -> pa.Table:
+        """The frames of an episode, bit for bit; all columns by default."""
+        return self.server.table(self.server.ask("GET", _episode(name, number, columns)))
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""
@@ -180,7 +180,7 @@ class Client:
 
     def write(self, runs: str, sql: str, form: str, sink: BinaryIO, parameters: Parameters, warn: Warn) -> None:
         """Write such a result as arrow (an IPC stream), parquet, csv or json. `warn` is told of runs left out."""
-        for chunk in self._server.chunks("/query", _question(runs, sql, form, parameters), warn):
+        for chunk in self.server.chunks("/query", question(runs, sql, form, parameters), warn):
             sink.write(chunk)
         sink.flush()
 
@@ -188,19 +188,19 @@ class Client:
         """The first rows of such a result, as texts for people."""
         sink = io.BytesIO()
         self.write(runs, sql, QueryForm.HEAD, sink, parameters, warn)
-        return self._server.read(sink.getvalue(), Head)
+        return self.server.read(sink.getvalue(), Head)
 
     def events(self, name: str, last: str = START) -> Iterator[Update]:
         """What happens to a run after the update whose id is `last`, until the connection ends. ServerError then."""
-        return self._server.events(f"{_run(name)}/events", last)
+        return self.server.events(f"{_run(name)}/events", last)
 
     def files(self, name: str, whole: bool = True) -> dict[str, File]:
         """The files of a run that nobody trains, by their paths in it; or else only those of its world."""
-        return self._server.get(f"{_run(name)}/files?whole={str(whole).lower()}", dict[str, File])
+        return self.server.get(f"{_run(name)}/files?whole={str(whole).lower()}", dict[str, File])
 
     def pieces(self, name: str, path: str, offset: int = 0) -> Iterator[bytes]:
         """The content of a file of a run from a byte on, as it comes."""
-        return self._server.pieces(f"{_run(name)}/file?path={quote(path, safe='')}", offset)
+        return self.server.pieces(f"{_run(name)}/file?path={quote(path, safe='')}", offset)
 
 
 def _policy(archive: bytes, version: int) -> Policy:
@@ -210,13 +210,18 @@ def _policy(archive: bytes, version: int) -> Policy:
         return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
 
 
-def _question(runs: str, sql: str, form: str, parameters: Parameters) -> QueryRequest:
+def question(runs: str, sql: str, form: str, parameters: Parameters) -> QueryRequest:
+    """What is asked of a server. RunError for what can name no run, ServerError for what no server takes."""
     pattern = runs if catalog.is_pattern(runs) else catalog.check_name(runs)
     return checked(QueryRequest, runs=pattern, sql=sql, form=form, parameters=dict(parameters))
 
 
 def _refuse(warning: str) -> None:
     raise RunError(f"{warning}; name the other runs")
+
+
+def _episode(name: str, number: int, columns: Sequence[str]) -> str:
+    return f"{_run(name)}/episodes/{int(number)}?{urlencode({'columns': columns}, doseq=True)}"
 
 
 def _run(name: str) -> str:

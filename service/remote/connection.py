@@ -7,8 +7,10 @@ those of SSL_CERT_FILE.
 from __future__ import annotations
 
 import ipaddress
-from collections.abc import Callable, Iterator
+import time
+from collections.abc import Callable, Generator, Iterator
 from contextlib import contextmanager
+from http import HTTPStatus
 from typing import TypeVar, final
 
 import httpx
@@ -34,6 +36,8 @@ KINDS: dict[str, type[T6GpsError]] = {
 """Errors that a server may tell, by their names; any other is a ServerError."""
 ANSWER_S, CONNECT_S = 3 * WAIT_S, 10.0
 """A server that says nothing for so long is said to be silent."""
+BUSY_S, SHORTEST_WAIT_S = WAIT_S, 0.1
+"""For so long a server that is busy is asked again, and at most so often."""
 T = TypeVar("T")
 M = TypeVar("M", bound=BaseModel)
 
@@ -73,14 +77,10 @@ class Connection:
     def ask(self, method: str, path: str, request: BaseModel | None = None) -> bytes:
         """The body of an answer."""
         body = None if request is None else request.model_dump(mode="json")
-        try:
-            answer = self._http.request(method, path, json=body)
-        except httpx.HTTPError as error:
-            raise self._unreachable(error) from None
-        self._check(answer)
-        return answer.content
+        with self._streamed(method, path, json=body) as answer:
+            return answer.read()
 
-    def chunks(self, path: str, request: BaseModel, warn: Callable[[str], object]) -> Iterator[bytes]:
+    def chunks(self, path: str, request: BaseModel, warn: Callable[[str], object]) -> Generator[bytes, None, None]:
         """The body of an answer to a request, as it comes, after its warnings."""
         with self._streamed("POST", path, json=request.model_dump(mode="json")) as answer:
             for warning in self.read(answer.headers.get(WARNINGS, "[]").encode(), list[str]):
@@ -101,14 +101,20 @@ class Connection:
     def _streamed(
         self, method: str, path: str, json: JsonValue = None, headers: dict[str, str] | None = None
     ) -> Iterator[httpx.Response]:
-        try:
-            with self._http.stream(method, path, json=json, headers=headers) as answer:
-                if answer.is_error:
-                    answer.read()
-                self._check(answer)
-                yield answer
-        except httpx.HTTPError as error:
-            raise self._unreachable(error) from None
+        deadline_s = time.monotonic() + BUSY_S
+        while True:
+            try:
+                with self._http.stream(method, path, json=json, headers=headers) as answer:
+                    if answer.is_error:
+                        answer.read()
+                    wait_s = _busy_s(answer)
+                    if wait_s is None or time.monotonic() + wait_s > deadline_s:
+                        self._check(answer)
+                        yield answer
+                        return
+            except httpx.HTTPError as error:
+                raise self._unreachable(error) from None
+            time.sleep(wait_s)  # a refused request has changed nothing
 
     def table(self, stream: bytes) -> pa.Table:
         """The table of an IPC stream that was answered."""
@@ -148,6 +154,13 @@ class Connection:
             return TypeAdapter(kind).validate_json(content)
         except ValidationError as error:
             raise self.nonsense(error) from None
+
+
+def _busy_s(answer: httpx.Response) -> float | None:
+    """After how long a server that is busy with others wants to be asked again; None for one that has answered."""
+    text = answer.headers.get("Retry-After", "")
+    is_busy = answer.status_code == HTTPStatus.SERVICE_UNAVAILABLE and text.isdecimal()
+    return max(float(text), SHORTEST_WAIT_S) if is_busy else None
 
 
 def _checked(url: str) -> str:

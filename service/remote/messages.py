@@ -22,6 +22,7 @@ LIFETIME_DAYS_MOST = 366.0
 RunName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._-]*$")]
 Pattern = Annotated[str, StringConstraints(min_length=1, max_length=NAME_LENGTH_N)]
 ParameterName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z_][A-Za-z0-9_]*$")]
+ColumnName = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z][a-z0-9_]*$")]
 TokenName = Annotated[str, StringConstraints(max_length=NAME_LENGTH_N, pattern=r"^[A-Za-z0-9][A-Za-z0-9._@-]*$")]
 Preset = Annotated[str, WithJsonSchema({"type": "string", "enum": presets()})]
 Key = Annotated[str, StringConstraints(max_length=100, pattern=r"^[a-z_]+(\.[a-z_]+)+$")]

@@ -44,7 +44,7 @@ def create(
     """
     version = metadata.version("t6gps")
     app = FastAPI(title="t6gps", version=version, docs_url=None, redoc_url=None, redirect_slashes=False)
-    app.state.served = Served(root, start)
+    app.state.served = Served(root, start, limits.query_s)
     app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now, limits=limits)
     for routes in (
         reading.routes,

@@ -42,12 +42,14 @@ class Limits:
     stalled_s      without a byte of a body
     requests       of one token: each second, and at once
     failures       of one address without a valid token: each second, and at once
+    query_s        that a query may take
     """
 
     body_bytes_n: int = 2**20
     stalled_s: float = 30.0
     requests: tuple[float, int] = (200.0, 400)
     failures: tuple[float, int] = (1.0, 20)
+    query_s: float = 30.0
 
 
 def utc_now() -> datetime:

@@ -45,6 +45,20 @@ def opened(run: Run, table: str) -> DeltaTable | None:
         return DeltaTable(location) if DeltaTable.is_deltatable(location) else None
 
 
+def state(run: Run) -> tuple[tuple[int, ...], ...]:
+    """What differs after every commit, and after a file of a table has come, gone, or got another size."""
+    return tuple(_state(run.tables / name) for name in schema.TABLES)
+
+
+def _state(folder: Path) -> tuple[int, ...]:
+    log = folder / "_delta_log"
+    try:
+        sizes = [entry.stat().st_size for entry in os.scandir(folder) if entry.is_file()]
+        return folder.stat().st_mtime_ns, len(sizes), sum(sizes), log.stat().st_mtime_ns, len(list(log.iterdir()))
+    except OSError:  # whoever reads the table says why
+        return ()
+
+
 def committed(delta: DeltaTable | None) -> int:
     """How many files have been committed, also by another version of the table: the next has this number."""
     version = None if delta is None else delta.transaction_version(_APPLICATION)

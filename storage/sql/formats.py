@@ -35,7 +35,16 @@ _STRING_OR_NOT_FINITE = re.compile(r'"[^"\\]*(?:\\.[^"\\]*)*"|-?(?:NaN|Infinity)
 
 def write(relation: duckdb.DuckDBPyRelation, form: str, sink: BinaryIO) -> None:
     """Write the rows of `relation` in a form of FORMS. QueryError for a type that the form cannot hold."""
-    FORMS[form](relation.project("*"), sink)  # which makes the names distinct
+    FORMS[form](_distinct(relation), sink)
+
+
+def rows(relation: duckdb.DuckDBPyRelation) -> pa.RecordBatchReader:
+    """The rows of `relation` as batches of Arrow, as they come. QueryError for a type that Arrow cannot hold."""
+    return _batches(_distinct(relation), BATCH_ROWS_N)
+
+
+def _distinct(relation: duckdb.DuckDBPyRelation) -> duckdb.DuckDBPyRelation:
+    return relation.project("*")  # which makes the names distinct
 
 
 def _arrow(relation: duckdb.DuckDBPyRelation, sink: BinaryIO) -> None:

@@ -1,7 +1,8 @@
 """SQL over the tables of runs, safe for questions from strangers.
 
-DuckDB runs in a child process (`sandbox`) that sees the tables and nothing else: no files, no network,
-no settings; one SELECT, bounded in length, nesting, memory, time and result.
+DuckDB runs in a process of the question's own (`sandbox`) that sees the tables and nothing else: no files, no network,
+no settings; one SELECT, bounded in length, nesting, memory, time and result. `inprocess` answers what the program's own
+user asks.
 """
 
 from __future__ import annotations
@@ -9,15 +10,12 @@ from __future__ import annotations
 import io
 import json
 import mmap
-import os
 import shutil
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import asdict, dataclass, field
-from typing import BinaryIO, TypeAlias
+from typing import BinaryIO
 
 import pyarrow as pa
 
@@ -26,20 +24,12 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import DataError, QueryError, T6GpsError
-from t6gps.storage.sql import cache, sandbox, views
-
-RunFiles: TypeAlias = dict[str, Files]
-"""The files of a table by the names of runs."""
+from t6gps.storage.sql import cache, sandbox, views, warm
+from t6gps.storage.sql.engine import RunFiles
 
 SQL_BYTES_N = 64 * 1024
 BRACKET_DEPTH_N = 100
-_ENVIRONMENT = {
-    # Allocators that reserve address space per thread would eat the child's bound before the query starts.
-    "ARROW_DEFAULT_MEMORY_POOL": "system",
-    "MALLOC_ARENA_MAX": "2",
-    "OMP_NUM_THREADS": "1",
-    "PYTHONIOENCODING": "utf-8",  # of its refusal, whatever the locale
-}
+_WORDS_BYTES_N = 2**16
 
 
 @dataclass(frozen=True)
@@ -91,7 +81,7 @@ def query(question: Question) -> pa.Table:
     one, for SQL that is refused or wrong, and beyond 64 kB of SQL, 100 nested brackets, 2 GiB of memory, a result of
     1 GB or the question's seconds.
     """
-    with _answer(question, "arrow") as result:
+    with answer(question, "arrow") as result:
         return pa.ipc.open_stream(mmap.mmap(result.fileno(), 0, access=mmap.ACCESS_READ)).read_all()
 
 
@@ -100,67 +90,60 @@ def write(question: Question, form: str, sink: BinaryIO) -> None:
 
     Its size is that of a file, not of memory. Raises errors as `query` does; nothing is written then.
     """
-    with _answer(question, form) as result:
+    with answer(question, form) as result:
         shutil.copyfileobj(result, sink)
     sink.flush()
 
 
 def head(question: Question) -> Head:
     """The first rows of what `query` would return. Raises errors as `query` does; the result has no bound."""
-    with _answer(question, "head") as result:
+    with answer(question, "head") as result:
         return Head(**json.load(result))
 
 
-@contextmanager
-def _answer(question: Question, form: str) -> Iterator[BinaryIO]:
-    """The file with the answer that a process of its own has given, in a form of formats.FORMS."""
-    _check_size(question.sql)
-    files, about = _read(question)
-    with tempfile.TemporaryFile() as result:
-        child = _asked(question, form, files, about, result)
-        if child.returncode == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
-            files, about = _read(question)
-            result.truncate(0)
-            child = _asked(question, form, files, about, result)
-        if child.returncode:
-            message = child.stderr.decode(errors="replace").strip()
-            if child.returncode == sandbox.DAMAGED:
-                raise _damaged(question.runs, files, *json.loads(message))
-            raise QueryError(_reason(child.returncode, message))
-        result.seek(0)
-        yield result
-
-
-def _asked(
-    question: Question, form: str, files: Mapping[str, RunFiles], about: pa.Table, result: BinaryIO
-) -> subprocess.CompletedProcess[bytes]:
-    """The process that has answered, or has said why not."""
+def answer(question: Question, form: str) -> BinaryIO:
+    """A file with what `write` would write, at its start. Whoever asked closes it. Raises errors as `query` does."""
     try:
-        return subprocess.run(
-            [sys.executable, "-P", "-m", sandbox.__name__],
-            input=_line(question, form, files) + _stream(about),
-            stdout=result,
-            stderr=subprocess.PIPE,
-            env={**os.environ, **_ENVIRONMENT},
-            timeout=question.timeout_s,
-            check=False,
-        )
-    except subprocess.TimeoutExpired as error:
-        raise QueryError(
-            f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
-            "iteration, or read the Parquet files directly"
-        ) from error
+        return _answered(question, form)
+    except DataError:
+        if not cache.forget_torn(question.runs):
+            raise
+        return _answered(question, form)  # as if there had been none
 
 
-def _read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
+def _answered(question: Question, form: str) -> BinaryIO:
+    check_size(question.sql)
+    files, about = read(question)
+    with ExitStack() as stack, tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as words:
+        result = stack.enter_context(tempfile.TemporaryFile())
+        asked.write(_line(question, form, files) + _stream(about))
+        asked.seek(0)
+        status = warm.running().answered(asked, result, words, question.timeout_s)
+        if status is None:
+            raise QueryError(
+                f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
+                "iteration, or read the Parquet files directly"
+            )
+        if status:
+            words.seek(0)
+            message = words.read(_WORDS_BYTES_N).decode(errors="replace").strip()
+            if status == sandbox.DAMAGED:
+                raise damaged(question.runs, files, *json.loads(message))
+            raise QueryError(_reason(status, message))
+        result.seek(0)
+        stack.pop_all()  # it stays open
+        return result
+
+
+def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
     """Of each table the files that the question may read, by run; and the table `runs`."""
     named, files = views.read_by(question.sql), {table: RunFiles() for table in schema.TABLES}
     of_files, rows = named - {"runs"}, []
     checked = of_files | {"frames"} if of_files else set()  # committed first, it shows what `episodes` has lost
-    read = cache.files if len(question.runs) > 1 else tables.files
+    found_by = cache.files if len(question.runs) > 1 else tables.files
     for run in question.runs:
         try:
-            found = read(run, checked) if checked else {}
+            found = found_by(run, checked) if checked else {}
             row = question.about.row(run) if "runs" in named else None
         except T6GpsError as error:
             if question.left_out is None:
@@ -192,7 +175,7 @@ def _stream(table: pa.Table) -> bytes:
     return sink.getvalue()
 
 
-def _damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
+def damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
     """The error for a table that cannot be read to its end. It names the run, which the query's process cannot."""
     for run in runs:
         try:
@@ -204,7 +187,8 @@ def _damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why
     return log.damaged(runs[0], table, why)
 
 
-def _check_size(sql: str) -> None:
+def check_size(sql: str) -> None:
+    """Raise QueryError for SQL that is too long, nests too deep, or is no Unicode."""
     try:
         size_n = len(sql.encode())
     except UnicodeEncodeError as error:

@@ -1,9 +1,8 @@
-"""The child process of `query`: one SELECT over the tables of runs, with everything else locked away.
+"""What the process of a query does: one SELECT over the tables of runs, with everything else locked away.
 
 It takes a question from its standard input, a line of JSON and then the table of runs as an Arrow IPC stream. It writes
 the result to its standard output in the form that is asked for (`formats`), and says on its standard error why it
-refused. Only DuckDB and pyarrow are loaded, and pandas
-where somebody installed it, since pyarrow.dataset then imports it: it starts in a fraction of a second.
+refused. `nursery` forks it.
 """
 
 from __future__ import annotations
@@ -13,17 +12,16 @@ import json
 import math
 import re
 import resource
-import sys
+import signal
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import Any
 
 import duckdb
 import pyarrow as pa
 
-from t6gps.storage.delta import parquet
-from t6gps.storage.errors import QueryError
-from t6gps.storage.sql import advice, formats, views
+from t6gps.storage.delta.parquet import Files
+from t6gps.storage.sql import advice, engine, formats, views
 
 RESULT_BYTES_N = 10**9
 MEMORY_BYTES_N = 2 * 1024**3
@@ -32,17 +30,13 @@ REFUSED, TOO_LARGE, DAMAGED = 2, 3, 4
 _FAULT = re.compile(r"Invalid Input Error: reading the stream registered as '(\w+)' failed: (.*)")
 """What DuckDB says of a table that pyarrow cannot read: its name, and why."""
 _THREADS_N = 2
-_SETTINGS = (
-    f"SET threads = {_THREADS_N}",
-    "SET memory_limit = '1GB'",
-    "SET temp_directory = ''",
-    "SET enable_external_access = false",  # also extensions, and the variables of this program
-    "SET lock_configuration = true",
-)
+_SETTINGS: Mapping[str, int | str] = {"threads": _THREADS_N, "memory_limit": "1GB"}
+_GRACE_S = 5
+"""Whoever asked ends the process when its seconds are over, and is given so much time for that."""
 
 
-def _limit(timeout_s: float) -> None:
-    """Bounds that hold even when the parent dies, or when DuckDB's own limits do not reach."""
+def limit(timeout_s: float) -> None:
+    """Set bounds that hold even when the parent dies, or when DuckDB's own limits do not reach."""
     pages_n = int(Path("/proc/self/statm").read_text(encoding="ascii").split()[0])
     memory = pages_n * resource.getpagesize() + MEMORY_BYTES_N
     processor_s = math.ceil(timeout_s * _THREADS_N) + 1
@@ -54,54 +48,47 @@ def _limit(timeout_s: float) -> None:
     ):
         least = min(most for most in (bound, *resource.getrlimit(kind)) if most != resource.RLIM_INFINITY)
         resource.setrlimit(kind, (least, least))
+    signal.setitimer(signal.ITIMER_REAL, timeout_s + _GRACE_S)  # which ends it, in whatever library it is
 
 
-def _relation(question: Mapping[str, Any], runs: pa.Table) -> duckdb.DuckDBPyRelation:
-    connection = duckdb.connect(":memory:")
-    for table, files in question["files"].items():
-        of_runs = {run: parquet.Files(**found) for run, found in files.items()}
-        connection.register(table, parquet.rows_of_runs(table, of_runs))
-    connection.register("runs", runs)
-    connection.register("columns", views.described(views.asked(runs.schema)))
-    for name, view in views.VIEWS.items():
-        connection.execute(f"CREATE TEMP VIEW {name} AS {view.sql}")
-    for setting in _SETTINGS:
-        connection.execute(setting)
-    _limit(question["timeout_s"])
-    statements = connection.extract_statements(question["sql"])
-    if [statement.type for statement in statements] != [duckdb.StatementType.SELECT]:
-        raise QueryError(advice.refusal([statement.type.name for statement in statements]))
-    wanted, given = statements[0].named_parameters, question["parameters"]
-    if wanted != given.keys():
-        raise QueryError(advice.parameters(wanted, given.keys()))
-    return connection.sql(question["sql"], params=given) if given else connection.sql(question["sql"])
+def fault(error: Exception) -> tuple[str, str] | None:
+    """The table that could not be read to its end, and why, where that is what a query ended with."""
+    found = _FAULT.match(str(error))
+    return None if found is None else (found[1], found[2])
 
 
-def _asked(source: BinaryIO) -> tuple[dict[str, Any], pa.Table]:
-    """The question, and the table of runs."""
-    question = json.loads(source.readline())
-    with pa.ipc.open_stream(source.read()) as stream:
-        return question, stream.read_all()
-
-
-def main() -> int:
+def answer() -> int:
     """Answer the question on the standard input; the exit status is 0, REFUSED, TOO_LARGE or DAMAGED."""
     pa.set_cpu_count(_THREADS_N)
     pa.set_io_thread_count(_THREADS_N)
-    question, runs = _asked(sys.stdin.buffer)
+    question, runs = _asked()
     try:
-        with open(sys.stdout.fileno(), "wb", closefd=False) as result:  # its last bytes may not fit either
+        with open(1, "wb", closefd=False) as result:  # its last bytes may not fit either
             formats.write(_relation(question, runs), question["form"], result)
-    except (duckdb.Error, pa.ArrowException, OSError, MemoryError, QueryError) as error:
+    except engine.ERRORS as error:
         if isinstance(error, OSError) and error.errno == errno.EFBIG:
             return TOO_LARGE
-        if fault := _FAULT.match(str(error)):
-            print(json.dumps(fault.groups()), file=sys.stderr)
-            return DAMAGED
-        print(advice.explained(error, question["sql"], views.asked(runs.schema)), file=sys.stderr)
-        return REFUSED
+        damage = fault(error)
+        words = json.dumps(damage) if damage else advice.explained(error, question["sql"], views.asked(runs.schema))
+        with open(2, "w", encoding="utf-8", errors="backslashreplace") as told:
+            told.write(words)
+        return DAMAGED if damage else REFUSED
     return 0
 
 
-if __name__ == "__main__":
-    sys.exit(main())
+def _relation(question: Mapping[str, Any], runs: pa.Table) -> duckdb.DuckDBPyRelation:
+    connection = engine.Engine(_SETTINGS)
+    files = {
+        table: {run: Files(**found) for run, found in of_runs.items()} for table, of_runs in question["files"].items()
+    }
+    connection.show(files, runs)
+    limit(question["timeout_s"])
+    return connection.ask(question["sql"], question["parameters"])
+
+
+def _asked() -> tuple[dict[str, Any], pa.Table]:
+    """The question, and the table of runs."""
+    with open(0, "rb", closefd=False) as source:
+        question = json.loads(source.readline())
+        with pa.ipc.open_stream(source.read()) as stream:
+            return question, stream.read_all()

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import threading
+from collections import Counter
 from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
@@ -20,13 +21,19 @@ from t6gps.service.remote.messages import Refusal, RunName, Scope
 from t6gps.service.server import audit
 from t6gps.service.server.feed import Feeds
 from t6gps.service.server.launching import Launch
+from t6gps.service.server.tokens import Token
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
 READING_N, COPYING_N, OPERATING_N, STREAMS_N = 2, 2, 8, 64
-"""How much may be under way at once: queries and the like, lists of files with their digests, changes that wait for
-their effect, streams of events."""
+"""How much may be under way at once: readings of a run, lists of files with their digests, changes that wait for their
+effect, streams of events."""
+ASKING_N, ASKING_OF_TOKEN_N = 4, 2
+"""Queries at once, and those of one token: each may take 2 GiB of memory, and nobody keeps others from asking."""
+ANSWERS_N, ANSWERS_OF_TOKEN_N = 16, 4
+"""Results that wait to be taken, each a file of 1 GB at most."""
+BUSY = "the server is busy with other requests of this kind; ask again in a second"
 Answers: TypeAlias = dict[int | str, dict[str, object]]
 REFUSED = (
     HTTPStatus.BAD_REQUEST,
@@ -58,8 +65,7 @@ class Slots:
     def take(self) -> None:
         """Take a slot. HTTPException where there is none."""
         if not self._free.acquire(blocking=False):
-            sentence = "the server is busy with other requests of this kind; ask again in a second"
-            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, sentence, {"Retry-After": "1"})
+            raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, BUSY, {"Retry-After": "1"})
 
     def give_back(self) -> None:
         """Give it back."""
@@ -75,16 +81,54 @@ class Slots:
             self.give_back()
 
 
+@final
+class Shares:
+    """Slots of which one token may have no more than so many."""
+
+    def __init__(self, most_n: int, of_token_n: int) -> None:
+        self._most_n, self._of_token_n = most_n, of_token_n
+        self._taken: Counter[str] = Counter()
+        self._lock = threading.Lock()
+
+    def take(self, token: Token) -> None:
+        """Take a slot for a token. HTTPException where there is none for it."""
+        with self._lock:
+            if self._taken.total() >= self._most_n or self._taken[token.id] >= self._of_token_n:
+                raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, BUSY, {"Retry-After": "1"})
+            self._taken[token.id] += 1
+
+    def give_back(self, token: Token) -> None:
+        """Give it back."""
+        with self._lock:
+            self._taken[token.id] -= 1
+            self._taken = +self._taken
+
+    @contextmanager
+    def taken(self, token: Token) -> Iterator[None]:
+        """Hold a slot meanwhile."""
+        self.take(token)
+        try:
+            yield
+        finally:
+            self.give_back(token)
+
+
 @dataclass(frozen=True)
 class Served:
-    """What a server serves: a root, what lets a job train a run, what is listened to, and room for heavy work."""
+    """What a server serves: a root, what lets a job train a run, what is listened to, and room for heavy work.
+
+    query_s   that a query may take
+    """
 
     root: Folder
     launch: Launch
+    query_s: float
     reading: Slots = field(default_factory=lambda: Slots(READING_N))
     copying: Slots = field(default_factory=lambda: Slots(COPYING_N))
     operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
     streams: Slots = field(default_factory=lambda: Slots(STREAMS_N))
+    asking: Shares = field(default_factory=lambda: Shares(ASKING_N, ASKING_OF_TOKEN_N))
+    answers: Shares = field(default_factory=lambda: Shares(ANSWERS_N, ANSWERS_OF_TOKEN_N))
     feeds: Feeds = field(default_factory=Feeds)
 
 
@@ -92,7 +136,12 @@ async def _served(request: Request) -> Served:  # async: what reads no file need
     return cast(Served, request.app.state.served)
 
 
+async def _token(request: Request) -> Token:
+    return cast(Token, request.state.token)
+
+
 Place = Annotated[Served, Depends(_served)]
+Asker = Annotated[Token, Depends(_token)]
 _bearer = HTTPBearer(auto_error=False, description="A token of `t6gps token create`, with scope and expiry.")
 
 

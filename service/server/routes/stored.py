@@ -4,9 +4,11 @@ from __future__ import annotations
 
 import io
 import json
-import tempfile
+import os
+import weakref
 from collections.abc import Sequence
-from dataclasses import asdict
+from contextlib import ExitStack
+from dataclasses import asdict, replace
 from http import HTTPStatus
 from pathlib import Path as FilePath
 from typing import Annotated
@@ -18,11 +20,20 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 
 from t6gps.service.api import asking as questions
 from t6gps.service.launch.fetch import File, FolderSource
-from t6gps.service.remote.messages import WARNINGS, QueryForm, QueryRequest
-from t6gps.service.server.routes.access import REFUSALS, Answers, NamedRun, NoSuchRunError, Place, Reading, contents
+from t6gps.service.remote.messages import WARNINGS, ColumnName, QueryForm, QueryRequest
+from t6gps.service.server.routes.access import (
+    REFUSALS,
+    Answers,
+    Asker,
+    NamedRun,
+    NoSuchRunError,
+    Place,
+    Reading,
+    contents,
+)
 from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
-from t6gps.storage import checkpoint, tables
+from t6gps.storage import checkpoint, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.sql import query as sql
@@ -31,7 +42,7 @@ routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS
 asking = APIRouter(dependencies=[Reading], responses=REFUSALS, tags=["read"])
 WARNINGS_N = 20
 NUMBER_MOST = 10**9
-CHUNK_BYTES_N = 2**16
+CHUNK_BYTES_N = 2**18
 ARCHIVE = "application/octet-stream"
 MEDIA = {
     QueryForm.ARROW: "application/vnd.apache.arrow.stream",
@@ -97,21 +108,23 @@ def policy(run: NamedRun, version: Annotated[int, Path(ge=0, le=NUMBER_MOST)], p
 
 
 @asking.post("/v1/query", response_class=Response, responses=contents(MEDIA.values(), "The result."))
-def query(request: QueryRequest, place: Place) -> Response:
+def query(request: QueryRequest, place: Place, asker: Asker) -> Response:
     """The result of one SELECT over a run or many. The header T6GPS-Warnings says which damaged ones it is without."""
     warnings = list[str]()
     try:
         question = questions.question(place.root, request.runs, request.sql, request.parameters, warnings.append)
     except RunError as error:
         raise NoSuchRunError(*error.args) from None
+    question = replace(question, timeout_s=place.query_s)
     if request.form is QueryForm.HEAD:
-        with place.reading.taken():
+        with place.asking.taken(asker):
             return JSONResponse(asdict(sql.head(question)), headers=_warned(warnings))
-    file = tempfile.TemporaryFile()  # noqa: SIM115 # whoever takes it slowly holds no memory, and the end closes it
-    with place.reading.taken():
-        sql.write(question, request.form, file)
-    headers = {"Content-Length": str(file.tell()), **_warned(warnings)}
-    file.seek(0)
+    with ExitStack() as room:
+        room.enter_context(place.answers.taken(asker))
+        with place.asking.taken(asker):
+            file = sql.answer(question, request.form)  # whoever takes it slowly holds no memory
+        weakref.finalize(file, room.pop_all().close)  # its last reader, done or gone, makes room
+    headers = {"Content-Length": str(os.fstat(file.fileno()).st_size), **_warned(warnings)}
     chunks = iter(lambda: file.read(CHUNK_BYTES_N), b"")
     return StreamingResponse(chunks, media_type=MEDIA[request.form], headers=headers)
 
@@ -126,11 +139,16 @@ def _warned(warnings: Sequence[str]) -> dict[str, str]:
 @routes.get(
     "/{name}/episodes/{number}", response_class=Response, responses=contents([MEDIA[QueryForm.ARROW]], "An IPC stream.")
 )
-def episode(run: NamedRun, number: Annotated[int, Path(ge=0, le=NUMBER_MOST)], place: Place) -> Response:
-    """The frames of an episode, bit for bit."""
+def episode(
+    run: NamedRun,
+    number: Annotated[int, Path(ge=0, le=NUMBER_MOST)],
+    place: Place,
+    columns: Annotated[list[ColumnName] | None, Query(max_length=len(schema.FRAMES))] = None,
+) -> Response:
+    """The frames of an episode, bit for bit; all columns, or those that are named."""
     sink = io.BytesIO()
     with place.reading.taken():
-        frames = tables.episode(run, number).frames
+        frames = tables.episode(run, number, columns=columns).frames
     with pa.ipc.new_stream(sink, frames.schema) as writer:
         writer.write_table(frames)
     return Response(sink.getvalue(), media_type=MEDIA[QueryForm.ARROW])

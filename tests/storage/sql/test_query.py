@@ -175,7 +175,7 @@ def test_memory_is_bounded(empty: Run) -> None:
 
 @pytest.mark.slow
 def test_memory_beyond_the_reach_of_duckdb_is_bounded_too() -> None:
-    script = "from t6gps.storage.sql import sandbox; sandbox._limit(1.0); print(len(bytes({bytes_n})))"
+    script = "from t6gps.storage.sql import sandbox; sandbox.limit(1.0); print(len(bytes({bytes_n})))"
     small, large = (
         subprocess.run(
             [sys.executable, "-c", script.format(bytes_n=bytes_n)], capture_output=True, text=True, check=False
