@@ -105,30 +105,19 @@ def head(question: Question) -> Head:
 
 def answer(question: Question, form: str) -> BinaryIO:
     """A file with what `write` would write, at its start. Whoever asked closes it. Raises errors as `query` does."""
+    try:
+        return _answered(question, form)
+    except DataError:
+        if not cache.forget_torn(question.runs):
+            raise
+        return _answered(question, form)  # as if there had been none
+
+
+def _answered(question: Question, form: str) -> BinaryIO:
     check_size(question.sql)
     files, about = read(question)
-    with ExitStack() as stack:
+    with ExitStack() as stack, tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as words:
         result = stack.enter_context(tempfile.TemporaryFile())
-        status, words = _asked(question, form, files, about, result)
-        if status == sandbox.DAMAGED and cache.forget_torn(question.runs):  # as if there had been none
-            files, about = read(question)
-            result.seek(0)
-            result.truncate()
-            status, words = _asked(question, form, files, about, result)
-        if status == sandbox.DAMAGED:
-            raise damaged(question.runs, files, *json.loads(words))
-        if status:
-            raise QueryError(_reason(status, words))
-        result.seek(0)
-        stack.pop_all()  # it stays open
-        return result
-
-
-def _asked(
-    question: Question, form: str, files: Mapping[str, RunFiles], about: pa.Table, result: BinaryIO
-) -> tuple[int, str]:
-    """How the process that has answered ended, and its words. QueryError where its seconds were over."""
-    with tempfile.TemporaryFile() as asked, tempfile.TemporaryFile() as words:
         asked.write(_line(question, form, files) + _stream(about))
         asked.seek(0)
         status = warm.running().answered(asked, result, words, question.timeout_s)
@@ -137,20 +126,27 @@ def _asked(
                 f"the query was stopped after {question.timeout_s:g} s; ask for fewer rows or columns, filter by "
                 "iteration, or read the Parquet files directly"
             )
-        words.seek(0)
-        return status, words.read(_WORDS_BYTES_N).decode(errors="replace").strip()
+        if status:
+            words.seek(0)
+            message = words.read(_WORDS_BYTES_N).decode(errors="replace").strip()
+            if status == sandbox.DAMAGED:
+                raise damaged(question.runs, files, *json.loads(message))
+            raise QueryError(_reason(status, message))
+        result.seek(0)
+        stack.pop_all()  # it stays open
+        return result
 
 
 def read(question: Question) -> tuple[dict[str, RunFiles], pa.Table]:
     """Of each table that the question may read the files, by run; and the table `runs`."""
     named, rows = views.read_by(question.sql), []
     of_files = named - {"runs"}
-    checked = of_files | {"frames"} if of_files else set()  # committed first, it shows what `episodes` has lost
     files = {table: RunFiles() for table in of_files}
-    read = cache.files if len(question.runs) > 1 else tables.files
+    checked = of_files | {"frames"} if of_files else set()  # committed first, it shows what `episodes` has lost
+    found_by = cache.files if len(question.runs) > 1 else tables.files
     for run in question.runs:
         try:
-            found = read(run, checked) if checked else {}
+            found = found_by(run, checked) if checked else {}
             row = question.about.row(run) if "runs" in named else None
         except T6GpsError as error:
             if question.left_out is None or isinstance(error, StoreError):

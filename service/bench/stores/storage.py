@@ -14,18 +14,24 @@ import pyarrow as pa
 
 from t6gps.service.bench.contenders import PRESET
 from t6gps.service.bench.rounds import Say
-from t6gps.service.bench.stores import contestants, many_runs, material
+from t6gps.service.bench.stores import contestants, many_runs, material, samples
 from t6gps.service.bench.stores.contestants import STORES, Store, T6Gps
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.records import Episode
+from t6gps.storage.sql import inprocess
 from t6gps.storage.sql.query import Question, query
 
 ROUNDS = 5
 SQL = "SELECT iteration, avg(cost) AS cost, max(com_z_m) AS com_z_m FROM frames GROUP BY iteration ORDER BY iteration"
-WAYS: Mapping[str, Callable[[Run, str], pa.Table]] = {"sandbox": lambda run, sql: query(Question([run], sql))}
+WAYS: Mapping[str, Callable[[Run, str], pa.Table]] = {
+    "in_process": lambda run, sql: inprocess.ask(Question([run], sql)),
+    "sandbox": lambda run, sql: query(Question([run], sql)),
+}
 """Ways to ask a run, beside DuckDB in this process on the same files."""
+READS_N = 20
+"""Episodes that are read from each store."""
 GROWTH_SHARE = 10
 """An iteration of the long run is so many times smaller."""
 NOTES = (
@@ -76,6 +82,7 @@ def measure(sizes: Sizes, say: Say) -> dict[str, float | None]:
     size_STORE                         bytes of frames over those of the numbers in memory, each in its own type
     episode_STORE_ms                   to read one episode with all columns
     sql_duckdb_ms, sql_WAY_ratio       a mean over frames by DuckDB in this process; what a way of WAYS takes over that
+    windows_ratio                      `samples.windows_ratio`
     append_growth                      the last fifth of a long run's commits over its first fifth
     runs_s, runs_first_s, mean_over_runs_s     `many_runs.many_runs`
     """
@@ -94,6 +101,7 @@ def measure(sizes: Sizes, say: Say) -> dict[str, float | None]:
         ours = stores["t6gps"]
         assert isinstance(ours, T6Gps)
         figures |= _asked(ours.run, sizes.rounds, say)
+        figures["windows_ratio"] = samples.windows_ratio(ours.run, say)
     few = episodes[: max(1, sizes.episodes_n // GROWTH_SHARE)]
     figures["append_growth"] = _growth(few, sizes.growth_n, say)
     return figures | many_runs.many_runs(few, sizes.runs_n, sizes.run_iterations_n, sizes.rounds, say)
@@ -113,14 +121,14 @@ def _appended(stores: Mapping[str, Store], episodes: Sequence[Episode], rounds: 
 
 
 def _read(stores: Mapping[str, Store], episodes: Sequence[Episode], rounds: int, say: Say) -> dict[str, float]:
-    """Milliseconds to read an episode, medians over some of each iteration. RunError for one with other costs."""
+    """Milliseconds to read an episode, medians over some of all iterations. RunError for one with other costs."""
     seconds: dict[str, list[float]] = {name: [] for name in stores}
-    for number in range(rounds):
-        place = number * 7 % len(episodes)
+    for number in range(READS_N):
+        place, iteration = number * 7 % len(episodes), number % rounds
         expected = episodes[place].frames.column("cost").to_numpy()
         for name, store in stores.items():
             start = time.perf_counter()
-            costs = store.costs(number * len(episodes) + place)
+            costs = store.costs(iteration * len(episodes) + place)
             seconds[name].append(time.perf_counter() - start)
             if not np.array_equal(costs, expected):
                 raise RunError(f"{name} gives other costs than were appended")
