@@ -142,13 +142,17 @@ class ActionValue:
         """Q [m] of inputs [s; e] [m, ni] (m/s)."""
         return policy.activations(self._layers, inputs)[-1][:, 0]
 
-    def slope(self, inputs: torch.Tensor, reach_m: float) -> torch.Tensor:
-        """dQ/du [m, nu] (1/s) at inputs [s; e] [m, ni]: zero where the winch cannot reach."""
+    def gradient(self, inputs: torch.Tensor) -> torch.Tensor:
+        """dQ/de [m, nu] (m/s) at inputs [s; e] [m, ni]."""
         values = policy.activations(self._layers, inputs)
         back = self._layers[-1][0].expand(len(inputs), -1)
         for number in reversed(range(len(self._layers) - 1)):
             back = torch.ops.aten.tanh_backward(back, values[number + 1]) @ self._layers[number][0]
-        return back[:, MOVED].mul(inputs[:, MOVED].abs() < 1).div_(reach_m)
+        return back[:, MOVED]
+
+    def slope(self, inputs: torch.Tensor, reach_m: float) -> torch.Tensor:
+        """dQ/du [m, nu] (1/s) at inputs [s; e] [m, ni]: zero where the winch cannot reach."""
+        return self.gradient(inputs).mul(inputs[:, MOVED].abs() < 1).div_(reach_m)
 
     def arrays(self) -> Arrays:
         """What the next iteration depends on, but for the transitions, which the run's tables hold."""

@@ -1,0 +1,178 @@
+"""A committed iteration of a run, learned from again: its episodes, policies, improved actions and models."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from t6gps.learner.bench import redone
+from t6gps.learner.bench.redone import Redone, Valued
+from t6gps.learner.improvers import transitions
+from t6gps.learner.rows import Floats, Ints
+from t6gps.learner.settings import Localization
+from t6gps.service.bench.rounds import Say
+from t6gps.service.config import Config
+from t6gps.service.execution.wiring import new_learner
+from t6gps.service.training import origin, policies
+from t6gps.storage import tables
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.records import Episode, PolicySnapshot
+from t6gps.workers.episode import policy, replay
+from t6gps.workers.episode.replay import Recorded
+from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
+from t6gps.workers.robot.symmetry import PROPER
+
+SAME = 1e-3
+"""Relative difference of the promised change above which an iteration was not learned from alike."""
+
+
+@dataclass(frozen=True)
+class Stored:
+    """An iteration of a run.
+
+    acting, newest   policies: the newest before the iteration, and the one that it has led to
+    redone           what the learner makes of its episodes, improved by the backward pass
+    valued           the same by the action value, None for a run without one
+    episode, first   episode of each row, and first row of each episode, counted from 0
+    """
+
+    config: Config
+    iteration: int
+    episodes: list[Episode]
+    acting: PolicySnapshot
+    newest: PolicySnapshot
+    redone: Redone
+    valued: Valued | None
+    episode: Ints
+    first: Ints
+
+    @property
+    def command_range_m(self) -> tuple[float, float]:
+        """Shortest and longest command."""
+        return self.config.robot.shortest_command_m, self.config.robot.longest_command_m
+
+    @property
+    def reach_m(self) -> float:
+        """Farthest that a winch comes in a control step, as the learner has it."""
+        return self.config.robot.winch_speed_m_per_s * CONTROL_STEP_S
+
+    @property
+    def led_by_value(self) -> bool:
+        """The action value has improved the actions that the newest policy was trained on."""
+        return self.valued is not None and self.iteration >= self.config.learner.value_from
+
+    def commands(self, snapshot: PolicySnapshot, rows: Ints) -> Floats:
+        """What a policy commands without noise in rows [m], within the range of commands [m, nu] (m)."""
+        act, observation = policy.ready(snapshot), self.redone.rows.observation
+        return np.stack([act(observation[row]) for row in rows]).clip(*self.command_range_m).astype(np.float32)
+
+    def staged(self, rows: Ints) -> Iterator[tuple[int, int, Recorded, Engine]]:
+        """For each of some rows [m] its place among them, its step, its episode, and a simulator of that."""
+        of = self.episode[rows]
+        numbers = np.unique(of)
+        recorded = (replay.recorded(self.episodes[number], self.config.rollout) for number in numbers.tolist())
+        for number, (episode, engine) in zip(numbers.tolist(), replay.staged(recorded), strict=True):
+            for place in np.flatnonzero(of == number).tolist():
+                yield place, int(rows[place] - self.first[number]), episode, engine
+
+
+def load(run: Run, iteration: int | None, say: Say) -> Stored:
+    """Learn from an iteration again, by default from the last one that the backward pass led.
+
+    RunError for an iteration that is not committed, whose policies are not kept, or whose run is of a later version;
+    ConfigError for a run whose models are in world axes.
+    """
+    config = origin.configured(run)
+    if config.learner.localization is Localization.TIME:
+        raise ConfigError(
+            f"run {run.name} has learner.localization = time, found models in world axes; bench surrogate judges "
+            "models in canonical frames: choose a run with another localization"
+        )
+    at = _chosen(run, config, iteration)
+    newest, acting = policies.load(run, at + 1), policies.load(run, at)
+    changed = origin.changes(run)
+    if changed is not None:
+        say(f"warning: {changed}")
+    episodes = tables.episodes_of(run, at)
+    say(f"learning from iteration {at} of run {run.name} again: {len(episodes)} episodes")
+    again = _by_backward_pass(config, acting, episodes)
+    valued = _by_action_value(run, config, at, again, say) if config.learner.value_from else None
+    lengths = np.array([episode.frames.num_rows for episode in episodes])
+    stored = Stored(
+        config=config,
+        iteration=at,
+        episodes=episodes,
+        acting=acting,
+        newest=newest,
+        redone=again,
+        valued=valued,
+        episode=np.repeat(np.arange(len(lengths)), lengths),
+        first=np.cumsum(lengths) - lengths,
+    )
+    _compare(run, stored, say)
+    return stored
+
+
+def _chosen(run: Run, config: Config, iteration: int | None) -> int:
+    committed = tables.committed_iterations(run)
+    if committed == 0:
+        raise RunError(f"run {run.name} has no committed iteration; let it finish one")
+    if iteration is None:
+        return min(committed, config.learner.value_from or committed) - 1
+    if iteration >= committed:
+        raise RunError(
+            f"run {run.name} has no iteration {iteration}; committed: 0 to {committed - 1}; choose one by --iteration"
+        )
+    return iteration
+
+
+def _by_backward_pass(config: Config, acting: PolicySnapshot, episodes: list[Episode]) -> Redone:
+    learner = config.learner.model_copy(update={"value_from": 0})
+    run = config.run.model_copy(update={"pipelined": False})
+    alone = config.model_copy(update={"learner": learner, "run": run})
+    frames = ((episode.frames, episode.noise_std_m) for episode in episodes)
+    weights = config.task.target_speed_m_per_s, config.task.vertical_weight
+    return redone.by_backward_pass(new_learner(alone), acting, frames, weights)
+
+
+def _by_action_value(run: Run, config: Config, at: int, again: Redone, say: Say) -> Valued:
+    robot, motion = config.robot, transitions.Motion(~PROPER)
+    reach_m = robot.winch_speed_m_per_s * CONTROL_STEP_S
+
+    def transitions_of(iteration: int) -> transitions.Transitions:
+        say(f"the action value learns from iteration {iteration}")
+        return transitions.recalled(tables.frames_of(run, iteration, transitions.COLUMNS), motion, reach_m)
+
+    return redone.by_action_value(
+        again,
+        config.learner,
+        config.run.seed,
+        at,
+        (robot.shortest_command_m, robot.longest_command_m),
+        lambda version: policies.load(run, version),
+        transitions_of,
+    )
+
+
+def _compare(run: Run, stored: Stored, say: Say) -> None:
+    """Say so where the iteration was not learned from as the run had learned from it."""
+    column = tables.read(run, "iterations", ["iteration", "predicted_cost_change"]).to_pylist()
+    then = next(row["predicted_cost_change"] for row in column if row["iteration"] == stored.iteration)
+    now = promised_mean(stored)
+    if abs(now - then) > SAME * abs(then):
+        say(
+            f"warning: iteration {stored.iteration} promised {then:.4f} m2/s2 a step when made and {now:.4f} now: "
+            "another build or machine learns otherwise; the figures are those of the present one"
+        )
+
+
+def promised_mean(stored: Stored) -> float:
+    """What `iterations.predicted_cost_change` is of the actions that led the iteration (m2/s2)."""
+    valued = stored.valued if stored.led_by_value else None
+    improved = stored.redone.improved if valued is None else valued.improved
+    values: NDArray[np.float32] = improved.predicted_cost_change[stored.redone.rows.continues]
+    return float(values.mean(dtype=np.float64))
