@@ -194,7 +194,7 @@ def bench(
         int | None, typer.Option(min=0, help="surrogate: by default the last that the backward pass led.")
     ] = None,
     pieces: Annotated[int | None, typer.Option(min=2, help="surrogate: of the branch test; 200 by default.")] = None,
-    states: Annotated[int | None, typer.Option(min=2, help="surrogate: of the gradient test; 1800 by default.")] = None,
+    states: Annotated[int | None, typer.Option(min=2, help="surrogate: of the gradient test; 600 by default.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="surrogate: of what is drawn; 0 by default.")] = None,
     as_json: Json = False,
 ) -> None:

@@ -19,7 +19,7 @@ from t6gps.learner.algorithm.sub_trajectories import sub_trajectories
 from t6gps.learner.bench import redone
 from t6gps.learner.rows import Floats, Ints
 from t6gps.service.bench.surrogate.agreement import Figures, agreement, mean_and_error, named
-from t6gps.service.bench.surrogate.stored import Stored
+from t6gps.service.bench.surrogate.stored import Crossing, Stored
 from t6gps.storage.errors import DataError, UnsoundStateError
 from t6gps.workers.episode import replay
 from t6gps.workers.episode.replay import Recorded
@@ -27,6 +27,8 @@ from t6gps.workers.episode.task import running_cost
 from t6gps.workers.robot.state import RobotState
 
 Array = NDArray[np.float64]
+RECORDED = "recorded"
+"""The branch without any change."""
 
 
 @dataclass(frozen=True)
@@ -79,15 +81,20 @@ def branched(stored: Stored, steps: Ints, wanted: dict[str, Floats]) -> dict[str
         )
         for name, command in commands.items()
     }
-    for place, first, episode, engine in stored.staged(steps[:, 0]):
+
+    def at(crossing: Crossing) -> None:
+        place, first, episode, engine, back = crossing
         for name, branch in branches.items():
+            back()
             try:
                 states = replay.commanded(engine, episode, first, commands[name][place].astype(np.float64))
             except UnsoundStateError:
                 continue  # the piece is counted among those that are left out
             branch.cost[place] = _costs(stored, episode, first, states)
             parts = replay.canonical(_first(states), int(episode.face[first + 1]), int(episode.element[first + 1]))
-            branch.after[place] = np.concatenate([parts[name] for name in columns])
+            branch.after[place] = np.concatenate([parts[column] for column in columns])
+
+    stored.visit(steps[:, 0], at)
     return branches
 
 
@@ -105,29 +112,36 @@ def _costs(stored: Stored, episode: Recorded, first: int, states: RobotState) ->
 def branch_test(stored: Stored, pieces: int, shares: dict[str, float], rng: np.random.Generator) -> Figures:
     """Promised and realised change of cost of each change and each share of it, by the names of the shares.
 
-    The one-step response is that to the whole of the first change.
+    The one-step response is that to the whole of u* of the backward pass.
     """
     steps = sampled(stored, pieces, rng)
-    wanted = wanted_changes(stored, steps)
-    still = branched(stored, steps, {"recorded": np.zeros_like(wanted["pass"])})["recorded"]
+    wanted = {
+        f"{name}{share_name}": share * change
+        for name, change in wanted_changes(stored, steps).items()
+        for share_name, share in shares.items()
+    }
+    branches = branched(stored, steps, {RECORDED: np.zeros_like(wanted["pass"])} | wanted)
+    still = branches.pop(RECORDED)
     recorded = np.concatenate([episode.frames.column("cost").to_numpy() for episode in stored.episodes])[steps + 1]
+    judged = {name: _judged(stored, steps, still, branch) for name, branch in branches.items()}
     figures: Figures = {
         "pieces": float(len(steps)),
         "piece_steps": float(steps.shape[1]),
         "replay_largest_cost_difference": float(np.nanmax(np.abs(still.cost - recorded))),
     }
-    for share_name, share in shares.items():
-        branches = branched(stored, steps, {name: share * change for name, change in wanted.items()})
-        for name, branch in branches.items():
-            figures |= named(f"branch_{name}{share_name}", _judged(stored, steps, still, branch))
-        if share == 1:
-            figures |= _response(stored, steps[:, 0], still, branches["pass"], rng)
-    return figures
+    for name, found in judged.items():
+        figures |= named(f"branch_{name}", found)
+    return figures | _response(stored, steps[:, 0], still, branches["pass"], rng)
 
 
 def _judged(stored: Stored, steps: Ints, still: Branch, branch: Branch) -> dict[str, float]:
     """Means over pieces, with standard errors, of the change of cost per step (m2/s2)."""
     sound = np.isfinite(branch.cost - still.cost).all(axis=1)
+    if sound.sum() < 2:
+        raise DataError(
+            f"{sound.sum()} of {len(sound)} pieces of iteration {stored.iteration} go here as recorded, two at "
+            "least are needed; judge the run with the t6gps that made it"
+        )
     promised = redone.promised(stored.redone.surrogate, steps[sound], branch.change[sound]).mean(axis=1)
     realised = (branch.cost - still.cost)[sound].mean(axis=1)
     (expected, expected_error), (found, found_error) = mean_and_error(promised), mean_and_error(realised)
@@ -138,7 +152,7 @@ def _judged(stored: Stored, steps: Ints, still: Branch, branch: Branch) -> dict[
         "realised": found,
         "realised_standard_error": found_error,
         "ratio": found / expected,
-        "unsound": float((~sound).sum()),
+        "left_out": float((~sound).sum()),
     }
 
 

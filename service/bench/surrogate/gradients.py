@@ -21,12 +21,10 @@ from numpy.typing import NDArray
 from t6gps.learner.bench import redone
 from t6gps.learner.rows import Floats, Ints
 from t6gps.service.bench.surrogate.agreement import Figures, agreement, named
-from t6gps.service.bench.surrogate.stored import Stored
+from t6gps.service.bench.surrogate.stored import Crossing, Stored
 from t6gps.storage.errors import UnsoundStateError
 from t6gps.workers.episode import replay
-from t6gps.workers.episode.replay import Recorded
 from t6gps.workers.episode.task import running_cost
-from t6gps.workers.physics.engine import Engine
 
 Array = NDArray[np.float64]
 STEPS = (5, 25)
@@ -84,16 +82,21 @@ def realised(stored: Stored, tried: Moved) -> Array:
     """Cost of the state after each step when e+ comes first, minus that when e- does [m, K]; NaN if one is unsound."""
     plus, minus = (tried.rest + stored.reach_m * way for way in (tried.plus, tried.minus))
     difference = np.full((len(tried.rows), max(STEPS)), np.nan)
-    for place, first, episode, engine in stored.staged(tried.rows):
+
+    def at(crossing: Crossing) -> None:
         try:
-            ahead, behind = (_costs(stored, engine, episode, first, way[place]) for way in (plus, minus))
+            ahead, behind = (_costs(stored, crossing, way[crossing.place]) for way in (plus, minus))
         except UnsoundStateError:
-            continue  # the state is counted among those that are left out
-        difference[place] = ahead - behind
+            return  # the state is counted among those that are left out
+        difference[crossing.place] = ahead - behind
+
+    stored.visit(tried.rows, at)
     return difference
 
 
-def _costs(stored: Stored, engine: Engine, episode: Recorded, first: int, action: Floats) -> Array:
+def _costs(stored: Stored, crossing: Crossing, action: Floats) -> Array:
+    _, first, episode, engine, back = crossing
+    back()
     states = replay.followed(engine, episode, first, action.astype(np.float64), stored.acting, max(STEPS))
     way = episode.waypoint[first] - episode.state.com[first, :2]
     return running_cost(states.com_velocity, way / np.hypot(*way), stored.config.task)
@@ -105,7 +108,7 @@ def gradient_test(stored: Stored, states: int, rng: np.random.Generator) -> Figu
     difference = realised(stored, tried)
     sound = np.isfinite(difference.sum(axis=1))
     discount = stored.config.learner.action_value.discount ** np.arange(max(STEPS))
-    figures: Figures = {"gradient_states": float(len(sound)), "gradient_unsound": float((~sound).sum())}
+    figures: Figures = {"gradient_states": float(len(sound)), "gradient_left_out": float((~sound).sum())}
     for name, slope in estimates(stored, tried).items():
         promised = np.einsum("mu,mu->m", slope, tried.plus - tried.minus)[sound]
         for steps in STEPS:

@@ -14,7 +14,7 @@ from t6gps.storage.catalog import Run
 
 SHARES = {"": 1.0, "_quarter": 0.25}
 """Shares of a change, by what they add to the names of figures."""
-PIECES, STATES = 200, 1800
+PIECES, STATES = 200, 600
 NOTES = (
     "branch: change of the running cost per step (m2/s2); pass, value: u* of the backward pass and of the action "
     "value; network: what the next policy took up",

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass
+from functools import partial
+from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,6 +15,7 @@ from t6gps.learner.bench.redone import Redone, Valued
 from t6gps.learner.improvers import transitions
 from t6gps.learner.rows import Floats, Ints
 from t6gps.learner.settings import Localization
+from t6gps.service import seeding
 from t6gps.service.bench.rounds import Say
 from t6gps.service.config import Config
 from t6gps.service.execution.wiring import new_learner
@@ -20,20 +23,39 @@ from t6gps.service.training import origin, policies
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
-from t6gps.storage.records import Episode, PolicySnapshot
+from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.episode import policy, replay
 from t6gps.workers.episode.replay import Recorded
-from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine
+from t6gps.workers.physics.bullet_engine import PyBulletEngine
+from t6gps.workers.physics.engine import CONTROL_STEP_S
 from t6gps.workers.robot.symmetry import PROPER
 
 SAME = 1e-3
 """Relative difference of the promised change above which an iteration was not learned from alike."""
 
 
+class Crossing(NamedTuple):
+    """Where branches leave an episode: place of the row among those visited, its step, and a simulator in that row.
+
+    back   brings the simulator back to the row, before the next branch
+    """
+
+    place: int
+    step: int
+    episode: Recorded
+    engine: PyBulletEngine
+    back: Callable[[], None]
+
+
+Branching = Callable[[Crossing], None]
+
+
 @dataclass(frozen=True)
 class Stored:
     """An iteration of a run.
 
+    plans            of the episodes
+    acted            policies that acted in the episodes, by version
     acting, newest   policies: the newest before the iteration, and the one that it has led to
     redone           what the learner makes of its episodes, improved by the backward pass
     valued           the same by the action value, None for a run without one
@@ -43,6 +65,8 @@ class Stored:
     config: Config
     iteration: int
     episodes: list[Episode]
+    plans: list[EpisodePlan]
+    acted: dict[int, PolicySnapshot]
     acting: PolicySnapshot
     newest: PolicySnapshot
     redone: Redone
@@ -70,14 +94,28 @@ class Stored:
         act, observation = policy.ready(snapshot), self.redone.rows.observation
         return np.stack([act(observation[row]) for row in rows]).clip(*self.command_range_m).astype(np.float32)
 
-    def staged(self, rows: Ints) -> Iterator[tuple[int, int, Recorded, Engine]]:
-        """For each of some rows [m] its place among them, its step, its episode, and a simulator of that."""
+    def visit(self, rows: Ints, branch: Branching) -> None:
+        """Run the episodes of some rows [m] again, and branch off in these."""
         of = self.episode[rows]
-        numbers = np.unique(of)
-        recorded = (replay.recorded(self.episodes[number], self.config.rollout) for number in numbers.tolist())
-        for number, (episode, engine) in zip(numbers.tolist(), replay.staged(recorded), strict=True):
-            for place in np.flatnonzero(of == number).tolist():
-                yield place, int(rows[place] - self.first[number]), episode, engine
+        numbers = np.unique(of).tolist()
+        recorded = (
+            replay.recorded(self.episodes[number], self.plans[number], self.config.rollout) for number in numbers
+        )
+        for number, (episode, engine) in zip(numbers, replay.staged(recorded), strict=True):
+            places = {int(rows[place] - self.first[number]): place for place in np.flatnonzero(of == number).tolist()}
+            at = partial(_at, branch, places, episode, engine)
+            replay.revisited(engine, episode, self.acted[_version(self.episodes[number])], places, at)
+
+
+def _at(
+    branch: Branching,
+    places: dict[int, int],
+    episode: Recorded,
+    engine: PyBulletEngine,
+    row: int,
+    back: Callable[[], None],
+) -> None:
+    branch(Crossing(places[row], row, episode, engine, back))
 
 
 def load(run: Run, iteration: int | None, say: Say) -> Stored:
@@ -109,12 +147,24 @@ def load(run: Run, iteration: int | None, say: Say) -> Stored:
         acting=acting,
         newest=newest,
         redone=again,
+        plans=_plans(config, at, episodes),
+        acted={version: policies.load(run, version) for version in sorted(set(map(_version, episodes)))},
         valued=valued,
         episode=np.repeat(np.arange(len(lengths)), lengths),
         first=np.cumsum(lengths) - lengths,
     )
     _compare(run, stored, say)
     return stored
+
+
+def _version(episode: Episode) -> int:
+    """The policy that acted in an episode."""
+    return int(episode.summary.column("policy_version")[0].as_py())
+
+
+def _plans(config: Config, iteration: int, episodes: list[Episode]) -> list[EpisodePlan]:
+    by_id = {plan.episode_id: plan for plan in seeding.training_plans(config, iteration)}
+    return [by_id[episode.episode_id] for episode in episodes]
 
 
 def _chosen(run: Run, config: Config, iteration: int | None) -> int:
