@@ -136,10 +136,10 @@ def branch_test(stored: Stored, pieces: int, shares: dict[str, float], rng: np.r
 
 def _judged(stored: Stored, steps: Ints, still: Branch, branch: Branch) -> dict[str, float]:
     """Means over pieces, with standard errors, of the change of cost per step (m2/s2)."""
-    sound = np.isfinite(branch.cost - still.cost).all(axis=1)
+    sound = np.isfinite((branch.cost - still.cost).sum(axis=1))
     if sound.sum() < 2:
         raise DataError(
-            f"{sound.sum()} of {len(sound)} pieces of iteration {stored.iteration} go here as recorded, two at "
+            f"{sound.sum()} of {len(steps)} pieces of iteration {stored.iteration} go here as recorded, two at "
             "least are needed; judge the run with the t6gps that made it"
         )
     promised = redone.promised(stored.redone.surrogate, steps[sound], branch.change[sound]).mean(axis=1)
