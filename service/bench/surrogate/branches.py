@@ -127,6 +127,7 @@ def branch_test(stored: Stored, pieces: int, shares: dict[str, float], rng: np.r
     figures: Figures = {
         "pieces": float(len(steps)),
         "piece_steps": float(steps.shape[1]),
+        "replay_median_cost_difference": float(np.nanmedian(np.abs(still.cost - recorded))),
         "replay_largest_cost_difference": float(np.nanmax(np.abs(still.cost - recorded))),
     }
     for name, found in judged.items():
