@@ -1,6 +1,7 @@
 """Laws of the training loop: a run that was stopped anywhere resumes as if it had not been."""
 
 from collections.abc import Iterator, Sequence
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -165,6 +166,12 @@ def test_the_iterations_table_summarises_its_episodes(tiny: Trained) -> None:
         assert row["cost_standard_error"] == pytest.approx(cost.std(ddof=1) / np.sqrt(len(cost)))
         assert row["steps"] == 90
         assert row["policy_version"] == row["iteration"]
+
+
+def test_the_realised_change_of_cost_is_that_since_the_iteration_before(tiny: Trained) -> None:
+    columns = tables.read(tiny.run, "iterations", ["iteration", "cost", "realised_cost_change"]).sort_by("iteration")
+    cost, change = columns["cost"].to_pylist(), columns["realised_cost_change"].to_pylist()
+    assert len(cost) > 2 and change == [None, *(after - before for before, after in pairwise(cost))]
 
 
 def test_an_evaluation_is_noise_free_repeatable_and_kept(tiny: Trained, tmp_path: Path) -> None:
