@@ -5,7 +5,7 @@ from __future__ import annotations
 import difflib
 import importlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
@@ -29,9 +29,11 @@ BENCHMARKS = {
 OPTIONS = {
     "pool": ("seconds", "rounds"),
     "server": ("seconds", "rounds"),
-    "surrogate": ("iteration", "pieces", "states", "seed"),
+    "surrogate": ("iteration", "pieces", "states", "seed", "overrides"),
 }
 """Benchmarks that can be told what or how much to measure, and what they can be told."""
+SPELLED = {"overrides": "set"}
+"""Options whose name on the command line is another one."""
 OF_RUN = ("surrogate",)
 """Benchmarks of a stored run."""
 LONG = ("learner", "pool", "scale", "server", "surrogate")
@@ -54,7 +56,7 @@ class Measurement:
         return json.dumps({**asdict(self.provenance), **entries})
 
 
-def measure(name: str, say: Say, run: Callable[[], Run] | None = None, **options: float) -> Measurement:
+def measure(name: str, say: Say, run: Callable[[], Run] | None = None, **options: float | Sequence[str]) -> Measurement:
     """Run a benchmark, which says how far it is; `run` opens the run that it is to judge.
 
     ConfigError for an unknown name, for options that the benchmark has not, and for a run too many or missing.
@@ -66,7 +68,8 @@ def measure(name: str, say: Say, run: Callable[[], Run] | None = None, **options
     for option in options:
         if option not in OPTIONS.get(name, ()):
             having = (benchmark for benchmark, others in OPTIONS.items() if option in others)
-            raise ConfigError(f"bench {name} has no --{option}; allowed for: {', '.join(having)}")
+            spelled = SPELLED.get(option, option)
+            raise ConfigError(f"bench {name} has no --{spelled}; allowed for: {', '.join(having)}")
     if (run is None) == (name in OF_RUN):
         wrong = "needs a run to judge: t6gps bench surrogate RUN" if run is None else "measures no run: leave RUN away"
         raise ConfigError(f"bench {name} {wrong}")

@@ -196,16 +196,18 @@ def bench(
     pieces: Annotated[int | None, typer.Option(min=2, help="surrogate: of the branch test; 200 by default.")] = None,
     states: Annotated[int | None, typer.Option(min=2, help="surrogate: of the gradient test; 600 by default.")] = None,
     seed: Annotated[int | None, typer.Option(min=0, help="surrogate: of what is drawn; 0 by default.")] = None,
+    overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
     """Measure speed, each figure beside a reference of the same run; or what a run's learner promises (surrogate)."""
-    options: dict[str, float | None] = {
+    options: dict[str, float | list[str] | None] = {
         "seconds": seconds,
         "rounds": rounds,
         "iteration": iteration,
         "pieces": pieces,
         "states": states,
         "seed": seed,
+        "overrides": overrides,
     }
     chosen = {key: value for key, value in options.items() if value is not None}
     run = None if run_name is None else partial(catalog.open_run, root, run_name)

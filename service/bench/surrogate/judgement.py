@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
 from t6gps.service.bench.rounds import Say
@@ -30,15 +32,17 @@ def surrogate(
     pieces: int = PIECES,
     states: int = STATES,
     seed: int = 0,
+    overrides: Sequence[str] = (),
 ) -> Figures:
     """Judge an iteration of a run, by default the last one that the backward pass led; one to two minutes.
 
     pieces, states   how many the branch test and the gradient test have
     seed             of what is drawn: pieces, states, signs, episodes held out, resampled episodes
+    overrides        settings of the learner that are judged on the same episodes in the place of the run's
 
     Errors as `stored.load`; DataError for an iteration with too few episodes or steps.
     """
-    stored = load(run, iteration, say)
+    stored = load(run, iteration, say, overrides)
     streams = [np.random.default_rng(each) for each in np.random.SeedSequence(seed).spawn(3)]
     figures: Figures = {
         "iteration": float(stored.iteration),

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import NamedTuple
@@ -15,6 +15,7 @@ from t6gps.learner.bench.redone import Redone, Valued
 from t6gps.learner.improvers import transitions
 from t6gps.learner.rows import Floats, Ints
 from t6gps.learner.settings import Localization
+from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.bench.rounds import Say
 from t6gps.service.config import Config
@@ -60,6 +61,7 @@ class Stored:
     redone           what the learner makes of its episodes, improved by the backward pass
     valued           the same by the action value, None for a run without one
     episode, first   episode of each row, and first row of each episode, counted from 0
+    led_by_value     the newest policy was trained on actions of the action value
     """
 
     config: Config
@@ -73,6 +75,7 @@ class Stored:
     valued: Valued | None
     episode: Ints
     first: Ints
+    led_by_value: bool
 
     @property
     def command_range_m(self) -> tuple[float, float]:
@@ -83,11 +86,6 @@ class Stored:
     def reach_m(self) -> float:
         """Farthest that a winch comes in a control step, as the learner has it."""
         return self.config.robot.winch_speed_m_per_s * CONTROL_STEP_S
-
-    @property
-    def led_by_value(self) -> bool:
-        """The action value has improved the actions that the newest policy was trained on."""
-        return self.valued is not None and self.iteration >= self.config.learner.value_from
 
     def commands(self, snapshot: PolicySnapshot, rows: Ints) -> Floats:
         """What a policy commands without noise in rows [m], within the range of commands [m, nu] (m)."""
@@ -118,19 +116,28 @@ def _at(
     branch(Crossing(places[row], row, episode, engine, back))
 
 
-def load(run: Run, iteration: int | None, say: Say) -> Stored:
+def load(run: Run, iteration: int | None, say: Say, overrides: Sequence[str] = ()) -> Stored:
     """Learn from an iteration again, by default from the last one that the backward pass led.
+
+    `overrides` are settings of the learner other than the run's; what the network took up is of the run all the same.
 
     RunError for an iteration that is not committed, whose policies are not kept, or whose run is of a later version;
     ConfigError for a run whose models are in world axes.
     """
-    config = origin.configured(run)
+    configuration.check_keys(overrides, "bench surrogate", ("learner.",), "the episodes are sampled already")
+    own, config = origin.configured(run), origin.configured(run, overrides)
+    networks = [(each.learner.observation, each.learner.hidden_layers) for each in (own, config)]
+    if networks[0] != networks[1]:
+        raise ConfigError(
+            f"bench surrogate cannot change the network of run {run.name}, whose policies are trained already; leave "
+            "learner.observation and learner.hidden_layers as they are"
+        )
     if config.learner.localization is Localization.TIME:
         raise ConfigError(
             f"run {run.name} has learner.localization = time, found models in world axes; bench surrogate judges "
             "models in canonical frames: choose a run with another localization"
         )
-    at = _chosen(run, config, iteration)
+    at = _chosen(run, own, iteration)
     newest, acting = policies.load(run, at + 1), policies.load(run, at)
     changed = origin.changes(run)
     if changed is not None:
@@ -152,8 +159,10 @@ def load(run: Run, iteration: int | None, say: Say) -> Stored:
         valued=valued,
         episode=np.repeat(np.arange(len(lengths)), lengths),
         first=np.cumsum(lengths) - lengths,
+        led_by_value=0 < own.learner.value_from <= at,
     )
-    _compare(run, stored, say)
+    if not overrides:
+        _compare(run, stored, say)
     return stored
 
 

@@ -59,6 +59,15 @@ def test_an_iteration_learned_from_again_promises_what_it_had_promised(run: Run,
     assert np.array_equal(F.reshape(len(F), -1), np.array(matrices, dtype=np.float32))
 
 
+def test_other_settings_of_the_learner_are_judged_on_the_same_episodes(run: Run, first: Stored) -> None:
+    other = load(run, 0, lambda _: None, ["learner.reduced_state=nodes+cables"])
+    assert other.redone.rows.state.shape[1] == first.redone.rows.state.shape[1] + 24
+    assert np.array_equal(other.redone.rows.observation, first.redone.rows.observation)
+    steps = branches.sampled(first, 4, np.random.default_rng(0))
+    ours, others = (branches.wanted_changes(stored, steps) for stored in (first, other))
+    assert np.array_equal(ours["network"], others["network"]) and not np.array_equal(ours["pass"], others["pass"])
+
+
 def test_pieces_without_a_change_cost_what_is_recorded(first: Stored) -> None:
     steps = branches.sampled(first, 4, np.random.default_rng(0))
     still = branches.branched(first, steps, {"none": np.zeros((*steps.shape, 24), dtype=np.float32)})["none"]
@@ -133,6 +142,8 @@ def _elsewhere(frames: pa.Table) -> pa.Table:
         (["surrogate", "tinny"], ["no run 'tinny'", "did you mean 'tiny'"]),
         (["surrogate", "tiny", "--iteration=7"], ["no iteration 7", "0 to 2", "--iteration"]),
         (["surrogate", "tiny", "--rounds=2"], ["no --rounds", "pool, server"]),
+        (["surrogate", "tiny", "--set=run.seed=1"], ["cannot change run.seed", "sampled already", "learner."]),
+        (["surrogate", "tiny", "--set=learner.hidden_layers=[8]"], ["network of run tiny", "learner.hidden_layers"]),
         (["physics", "tiny"], ["bench physics measures no run"]),
         (["physics", "--pieces=3"], ["no --pieces", "surrogate"]),
     ],
