@@ -171,7 +171,7 @@ ITERATIONS = _schema(
         "realised_cost_change",
         pa.float64(),
         "m2/s2",
-        "cost minus that of the iteration before, which promised its predicted_cost_change; null in the first",
+        "cost minus that of the iteration that trained the policy and promised a change; null for the untrained one",
         nullable=True,
     ),
 )

@@ -134,7 +134,7 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
     row |= _sampled(summaries) | report.iteration | durations
     row["left_out"] = len(plans) - len(files)
-    row["realised_cost_change"] = _since_before(run, iteration, row["cost"])
+    row["realised_cost_change"] = _realised(run, batch.snapshot.version, row["cost"])
     policies = [executor.learner.policy()] if iteration else [batch.snapshot, executor.learner.policy()]
     learned = Learned(row, report.classes, report.models, policies)
     iterations.commit(run, iteration, _tended(executor, files), learned)
@@ -182,11 +182,11 @@ def _sampled(summary: pa.Table) -> dict[str, Any]:
     return result
 
 
-def _since_before(run: Run, iteration: int, cost: float) -> float | None:
-    """How far the cost of an iteration is from that of the one before (m2/s2); None in the first."""
-    if iteration == 0:
+def _realised(run: Run, version: int, cost: float) -> float | None:
+    """What training this version of the policy has changed of the cost (m2/s2); None for the untrained one."""
+    if version == 0:
         return None
-    before = tables.read(run, "iterations", ["cost"], pc.field("iteration") == iteration - 1)
+    before = tables.read(run, "iterations", ["cost"], pc.field("iteration") == version - 1)
     return cost - float(before.column("cost")[0].as_py())
 
 
