@@ -5,6 +5,8 @@ for done, total in learner.segment():   ...         each phase reports its progr
 for done, total in learner.fit():       ...
 for done, total in learner.backward_pass(): ...
 for done, total in learner.supervise(): ...         learner.snapshot is now the next policy version
+
+`learner.done` holds what the phases so far have found.
 """
 
 from __future__ import annotations
@@ -86,7 +88,7 @@ class Learner:
         self._motion = transitions.Motion(task.mirrored)
         readings: list[Reading] = [self._rows, *([self._motion] if self._value else [])]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
-        self._done = _Done()
+        self.done = Done()
 
     def _rng(self, stream: Stream, round_: int = 0) -> np.random.Generator:
         key = branch(self.snapshot.version, stream, *([round_] if round_ else []))
@@ -117,7 +119,7 @@ class Learner:
 
     def segment(self) -> Progress:
         """Join the segments of all episodes and classify them (lines 3 to 5)."""
-        self._done = _Done()
+        self.done = Done()
         columns, places = self._episodes.joined()
         rows = self._rows.rows(columns)
         if self._value:
@@ -128,13 +130,13 @@ class Learner:
         segments = classify(rows, places)
         segmented = self._settings.localization in SEGMENTED
         groups = group(segments, self._settings.smallest_class_segments) if segmented else []
-        self._done.segmented = Segmented(rows, segments, groups)
+        self.done.segmented = Segmented(rows, segments, groups)
         yield 2, 2
 
     def fit(self) -> Progress:
         """Fit the local models of every class (lines 4 to 6)."""
-        segmented = _of(self._done.segmented, "segment")
-        plans = _plans(self._settings, segmented, self._run_seed, self.snapshot.version)
+        segmented = _of(self.done.segmented, "segment")
+        plans = fit_plans(self._settings, segmented, self._run_seed, self.snapshot.version)
         if not plans:
             raise DataError("no transition of this iteration can be learned from: every step ends in a jump")
         jobs = (local_models.job(segmented.rows, plan) for plan in plans.values())
@@ -143,14 +145,14 @@ class Learner:
             fits[number] = fitted
             yield len(fits), len(plans)
         series = patch(list(plans.values()), list(fits.values()), len(segmented.rows.acts))
-        self._done.fitted = Fitted(fits, series)
+        self.done.fitted = Fitted(fits, series)
 
     def backward_pass(self) -> Progress:
         """Improve the actions along all sub-trajectories (lines 8 to 11)."""
-        self._done.improved = yield from self._improve(self.snapshot, 0)
+        self.done.improved = yield from self._improve(self.snapshot, 0)
 
     def _improve(self, snapshot: PolicySnapshot, round_: int) -> Generator[tuple[int, int], None, Improved]:
-        rows, series = _of(self._done.segmented, "segment").rows, _of(self._done.fitted, "fit").series
+        rows, series = _of(self.done.segmented, "segment").rows, _of(self.done.fitted, "fit").series
         value, draws = self._value if self._led_by_value else None, partial(self._rng, Stream.ACTION_VALUE, round_)
         surrogate = Surrogate(rows, series, *self._task.cost_weights)
         leads = leading(value, surrogate, snapshot, draws, self._task.command_range_m, self._settings)
@@ -161,8 +163,8 @@ class Learner:
 
         Where the action value leads, further rounds each learn it anew for the policy so far, improve and train.
         """
-        segmented, fitted = _of(self._done.segmented, "segment"), _of(self._done.fitted, "fit")
-        rows, improved, iteration = segmented.rows, _of(self._done.improved, "backward_pass"), self.snapshot.version
+        segmented, fitted = _of(self.done.segmented, "segment"), _of(self.done.fitted, "fit")
+        rows, improved, iteration = segmented.rows, _of(self.done.improved, "backward_pass"), self.snapshot.version
         seen, newest, losses = rows.observation[:, : SEEN_N[self._settings.observation]], self.snapshot, []
         for round_ in range(self._settings.rounds if self._led_by_value else 1):
             if round_:
@@ -176,13 +178,13 @@ class Learner:
         divergence = _divergence(newest, rows, seen, self._task.command_range_m)
         trained = Trained(supervised.Loss(losses[0].before, losses[-1].after), divergence)
         results = Iteration(segmented, fitted, improved, trained)
-        self._done = _Done(report=report(results, iteration, self._task.command_range_m, *self._task.cost_weights))
+        self.done = Done(report=report(results, iteration, self._task.command_range_m, *self._task.cost_weights))
         if self._value:
             self._value.file_away()
 
     def report(self) -> Report:
         """What the iteration just finished adds to the tables `iterations` and `classes`."""
-        return _of(self._done.report, "supervise")
+        return _of(self.done.report, "supervise")
 
     def state(self) -> LearnerState:
         """What the next iteration depends on, between two iterations: policies, replayed pairs, the action value."""
@@ -205,7 +207,7 @@ class Learner:
 
 
 @dataclass
-class _Done:
+class Done:
     """What the phases of the iteration at work have found; after the last one, the report on it."""
 
     segmented: Segmented | None = None
@@ -221,7 +223,7 @@ def _of(result: Result | None, phase: str) -> Result:
     return result
 
 
-def _plans(
+def fit_plans(
     settings: LearnerSettings, segmented: Segmented, run_seed: int, iteration: int
 ) -> dict[int, local_models.ClassPlan]:
     """What is fitted, by the way in which samples are grouped."""

@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from t6gps.storage.fields import numbers, scalar, vector, vector_length
 
 SCHEMA_VERSION = 6
-"""Grows with every change. Versions 2, 3 and 5 added columns at the end of `iterations`, version 2 of `classes`,
+"""Grows with every change. Versions 2, 3, 5 and 6 added columns at the end of `iterations`, version 2 of `classes`,
 version 6 of `frames`; they are nullable, since older runs have none. Version 4 added the nodes to `observation`.
 Version 5 has null where older versions had 0 for what there is none of: standard errors of one episode, waypoints of a
-far direction, modes and residual of a class without a sample. Version 6 added `models`, `policies` and the tables of
-evaluations."""
+far direction, modes and residual of a class without a sample. Version 6 added `models`, `policies`, the tables of
+evaluations, and `realised_cost_change` to `iterations`."""
 SENSORS_N, SHAPE_N = 47, 36
 OBSERVATION_N = SENSORS_N + SHAPE_N
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
@@ -167,6 +167,13 @@ ITERATIONS = _schema(
         pa.float64(),
         "1",
         "stuck by distance: mean over the episodes that last 1 s; null where none does",
+        nullable=True,
+    ),
+    scalar(
+        "realised_cost_change",
+        pa.float64(),
+        "m2/s2",
+        "cost minus that of the iteration that trained the policy and promised a change; null for the untrained one",
         nullable=True,
     ),
 )

@@ -136,3 +136,16 @@ def frames_of(run: Run, iteration: int, columns: Sequence[str]) -> dict[int, pa.
         int(number): table.slice(start, length).select(columns)
         for number, start, length in zip(numbers, first.tolist(), lengths.tolist(), strict=True)
     }
+
+
+def episodes_of(run: Run, iteration: int) -> list[Episode]:
+    """The episodes of an iteration with all their columns, in ascending order of their ids."""
+    where = pc.field("iteration") == iteration
+    frames = read(run, "frames", filter=where).sort_by([("episode_id", "ascending"), ("step", "ascending")])
+    summary = read(run, "episodes", filter=where).sort_by("episode_id")
+    lengths = summary.column("steps").to_numpy() + 1
+    first = np.cumsum(lengths) - lengths
+    return [
+        Episode(frames.slice(start, length), summary.slice(number, 1))
+        for number, (start, length) in enumerate(zip(first.tolist(), lengths.tolist(), strict=True))
+    ]

@@ -17,6 +17,7 @@ from t6gps.learner.rows import NONE, VELOCITY_N, AnyArray, Columns, Flags, Float
 from t6gps.learner.settings import ReducedState
 from t6gps.storage import schema
 from t6gps.storage.errors import DataError
+from t6gps.storage.fields import vector_length
 
 LOWER_NODES_N = 6
 
@@ -27,6 +28,13 @@ _PARTS: dict[ReducedState, Sequence[str]] = {
     "nodes+vels": ("nodes", "node_velocities"),
     "nodes+cables": ("nodes", "rest_lengths"),
 }
+
+
+def whole_columns(reduced_state: ReducedState) -> dict[str, slice]:
+    """Columns of `frames` that a reduced state has whole, and their place in it; lower nodes are half of a column."""
+    names = ("com_velocity", *(() if reduced_state == "lower-nodes" else _PARTS[reduced_state]))
+    ends = np.cumsum([vector_length(schema.FRAMES.field(name)) or 0 for name in names]).tolist()
+    return {name: slice(first, end) for name, first, end in zip(names, [0, *ends], ends, strict=False)}
 
 
 @dataclass(frozen=True)

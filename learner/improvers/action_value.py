@@ -117,7 +117,7 @@ class ActionValue:
             others = None if farther is None else torch.from_numpy(farther[rows]).mul_(share)
             for _ in range(settings.ascents):
                 inputs[:, MOVED] = _moved(command, rest_lengths, newest.reach_m)
-                slope = self._gradient(inputs)[:, MOVED]
+                slope = self.gradient(inputs)
                 if others is not None:
                     slope = slope.mul_(1 - share).add_(others)
                 wanted = start + settings.step_weight * _of_commands(slope, inputs, newest.reach_m)
@@ -162,9 +162,13 @@ class ActionValue:
         """Q [m] of inputs [s; e] [m, ni] (m/s): the mean of all critics."""
         return _mean([critic.values(inputs) for critic in self._critics])[:, 0]
 
+    def gradient(self, inputs: torch.Tensor) -> torch.Tensor:
+        """dQ/de [m, nu] (m/s) at inputs [s; e] [m, ni]."""
+        return self._gradient(inputs)[:, MOVED]
+
     def slope(self, inputs: torch.Tensor, reach_m: float) -> torch.Tensor:
         """dQ/du [m, nu] (1/s) at inputs [s; e] [m, ni]: zero where the winch cannot reach."""
-        return _of_commands(self._gradient(inputs)[:, MOVED], inputs, reach_m)
+        return _of_commands(self.gradient(inputs), inputs, reach_m)
 
     def _gradient(self, inputs: torch.Tensor) -> torch.Tensor:
         return _mean([critic.gradient(inputs) for critic in self._critics])

@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 import importlib
 import json
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
 from t6gps.service.bench.rounds import Say
 from t6gps.service.provenance import Provenance, provenance
+from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
 
 BENCHMARKS = {
@@ -21,13 +22,23 @@ BENCHMARKS = {
     "server": "t6gps.service.bench.server",
     "soundness": "t6gps.workers.bench.soundness",
     "storage": "t6gps.service.bench.stores.storage",
+    "surrogate": "t6gps.service.bench.surrogate.judgement",
 }
 """Module of each benchmark; the function in it has the benchmark's name."""
 
 
-SIZES = {"pool": ("seconds", "rounds"), "server": ("seconds", "rounds"), "storage": ("rounds",)}
-"""Benchmarks that can be told how long or how often to measure."""
-LONG = ("learner", "pool", "scale", "server", "storage")
+OPTIONS = {
+    "pool": ("seconds", "rounds"),
+    "server": ("seconds", "rounds"),
+    "storage": ("rounds",),
+    "surrogate": ("iteration", "pieces", "states", "seed", "overrides"),
+}
+"""Benchmarks that can be told what or how much to measure, and what they can be told."""
+SPELLED = {"overrides": "set"}
+"""Options whose name on the command line is another one."""
+OF_RUN = ("surrogate",)
+"""Benchmarks of a stored run."""
+LONG = ("learner", "pool", "scale", "server", "storage", "surrogate")
 """Benchmarks that say how far they are."""
 
 
@@ -47,22 +58,28 @@ class Measurement:
         return json.dumps({**asdict(self.provenance), **entries})
 
 
-def measure(name: str, say: Say, **sizes: float) -> Measurement:
-    """Run a benchmark, which says how far it is.
+def measure(name: str, say: Say, run: Callable[[], Run] | None = None, **options: float | Sequence[str]) -> Measurement:
+    """Run a benchmark, which says how far it is; `run` opens the run that it is to judge.
 
-    ConfigError for an unknown name, or for sizes of a benchmark that has none.
+    ConfigError for an unknown name, for options that the benchmark has not, and for a run too many or missing.
     """
     if name not in BENCHMARKS:
         close = difflib.get_close_matches(name, BENCHMARKS, n=1)
         hint = f" (did you mean {close[0]}?)" if close else ""
         raise ConfigError(f"unknown benchmark '{name}'{hint}; allowed: {', '.join(BENCHMARKS)}")
-    unknown = [size for size in sizes if size not in SIZES.get(name, ())]
-    if unknown:
-        has = [other for other, known in SIZES.items() if unknown[0] in known]
-        raise ConfigError(f"bench {name} has no --{' and no --'.join(unknown)}; allowed for: {', '.join(has)}")
+    for option in options:
+        if option not in OPTIONS.get(name, ()):
+            having = (benchmark for benchmark, others in OPTIONS.items() if option in others)
+            spelled = SPELLED.get(option, option)
+            raise ConfigError(f"bench {name} has no --{spelled}; allowed for: {', '.join(having)}")
+    if (run is None) == (name in OF_RUN):
+        wrong = "needs a run to judge: t6gps bench surrogate RUN" if run is None else "measures no run: leave RUN away"
+        raise ConfigError(f"bench {name} {wrong}")
     module = importlib.import_module(BENCHMARKS[name])
-    run: Callable[..., dict[str, float | None]] = getattr(module, name)
+    bench: Callable[..., dict[str, float | None]] = getattr(module, name)
     if name in LONG:
-        run = partial(run, say)
+        bench = partial(bench, say)
+    if run is not None:
+        bench = partial(bench, run())
     threads, notes = getattr(module, "THREADS", 1), tuple(getattr(module, "NOTES", ()))
-    return Measurement(name, provenance(), threads, notes, run(**sizes))
+    return Measurement(name, provenance(), threads, notes, bench(**options))

@@ -11,6 +11,7 @@ import logging
 import shlex
 import sys
 from collections.abc import Sequence
+from functools import partial
 from pathlib import Path
 from typing import Annotated, NoReturn
 
@@ -40,6 +41,7 @@ from t6gps.service.studies.declared import Scale
 from t6gps.service.training import origin, publishing, session
 from t6gps.service.training.session import Engine
 from t6gps.service.views import terminal
+from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, T6GpsError
 
@@ -185,6 +187,7 @@ def evaluate(
 @app.command()
 def bench(
     name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
+    run_name: Annotated[str | None, typer.Argument(metavar="[RUN]", help="surrogate: the run to judge.")] = None,
     root: Root = DEFAULT_ROOT,
     seconds: Annotated[
         float | None, typer.Option(help="pool, server: seconds of each measurement; 30 by default.")
@@ -192,12 +195,28 @@ def bench(
     rounds: Annotated[
         int | None, typer.Option(help="pool, server, storage: measurements of each contender; 5 by default.")
     ] = None,
+    iteration: Annotated[
+        int | None, typer.Option(min=0, help="surrogate: by default the last that the backward pass led.")
+    ] = None,
+    pieces: Annotated[int | None, typer.Option(min=2, help="surrogate: of the branch test; 200 by default.")] = None,
+    states: Annotated[int | None, typer.Option(min=2, help="surrogate: of the gradient test; 600 by default.")] = None,
+    seed: Annotated[int | None, typer.Option(min=0, help="surrogate: of what is drawn; 0 by default.")] = None,
+    overrides: Overrides = None,
     as_json: Json = False,
 ) -> None:
-    """Measure speed, each figure beside a reference of the same run."""
-    sizes = {"seconds": seconds, "rounds": rounds}
-    chosen = {key: value for key, value in sizes.items() if value is not None}
-    measurement = benchmarks.measure(name, terminal.say, **chosen)
+    """Measure speed, each figure beside a reference of the same run; or what a run's learner promises (surrogate)."""
+    options: dict[str, float | list[str] | None] = {
+        "seconds": seconds,
+        "rounds": rounds,
+        "iteration": iteration,
+        "pieces": pieces,
+        "states": states,
+        "seed": seed,
+        "overrides": overrides,
+    }
+    chosen = {key: value for key, value in options.items() if value is not None}
+    run = None if run_name is None else partial(catalog.open_run, root, run_name)
+    measurement = benchmarks.measure(name, terminal.say, run, **chosen)
     if as_json:
         typer.echo(measurement.to_json())
         return

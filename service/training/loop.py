@@ -21,13 +21,14 @@ from typing import Any, Protocol, cast
 
 import numpy as np
 import pyarrow as pa
+import pyarrow.compute as pc
 
 from t6gps.learner.phases import PHASES
 from t6gps.learner.port import Manifest
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.execution.executor import Executor
-from t6gps.storage import checkpoint
+from t6gps.storage import checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.checkpoint import JSON
 from t6gps.storage.delta import iterations
@@ -133,6 +134,7 @@ def _iterate(config: Config, run: Run, executor: Executor, observer: Observer, i
     row: dict[str, Any] = {"iteration": iteration, "policy_version": batch.snapshot.version}
     row |= _sampled(summaries) | report.iteration | durations
     row["left_out"] = len(plans) - len(files)
+    row["realised_cost_change"] = _realised(run, batch.snapshot.version, row["cost"])
     policies = [executor.learner.policy()] if iteration else [batch.snapshot, executor.learner.policy()]
     learned = Learned(row, report.classes, report.models, policies)
     iterations.commit(run, iteration, _tended(executor, files), learned)
@@ -178,6 +180,14 @@ def _sampled(summary: pa.Table) -> dict[str, Any]:
     ):
         result[reported], _ = mean_and_error(summary[column])
     return result
+
+
+def _realised(run: Run, version: int, cost: float) -> float | None:
+    """What training this version of the policy has changed of the cost (m2/s2); None for the untrained one."""
+    if version == 0:
+        return None
+    before = tables.read(run, "iterations", ["cost"], pc.field("iteration") == version - 1)
+    return cost - float(before.column("cost")[0].as_py())
 
 
 def mean_and_error(column: pa.ChunkedArray) -> tuple[float | None, float | None]:

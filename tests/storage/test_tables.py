@@ -104,7 +104,7 @@ def test_a_run_of_version_5_is_read_without_models_and_policies_and_can_go_on(ru
 def test_a_run_of_the_first_schema_version_is_read_with_null_for_later_columns_and_can_go_on(
     run: Run, commit: Any
 ) -> None:
-    later = {"iterations": 5, "classes": 3}
+    later = {"iterations": 6, "classes": 3}
     commit(run, 0)
     for name, n in later.items():
         rows = tables.read(run, name)

@@ -7,7 +7,8 @@ docs/bullet-hooks.md.
 from __future__ import annotations
 
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from typing import Protocol
 
 import numpy as np
@@ -115,6 +116,24 @@ class PyBulletEngine(Engine):
         self._state = self._stepper.control_step(self.bodies, self._state.rest_lengths, within)
         check_sound(self._state, self._terrain)
         return self._state
+
+    @contextmanager
+    def branching(self) -> Iterator[Callable[[], None]]:
+        """Gives a function that brings back the present state as often as it is called, contacts included.
+
+        `reset` cannot: a state does not say which contacts it has. The end of the context brings it back, too.
+        """
+        saved, state = pybullet.saveState(physicsClientId=self.client), self._state
+
+        def back() -> None:
+            pybullet.restoreState(saved, physicsClientId=self.client)
+            self._state = state
+
+        try:
+            yield back
+        finally:
+            back()
+            pybullet.removeState(saved, physicsClientId=self.client)
 
     def close(self) -> None:
         """Close the client; a second call does nothing."""

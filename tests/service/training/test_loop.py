@@ -167,6 +167,17 @@ def test_the_iterations_table_summarises_its_episodes(tiny: Trained) -> None:
         assert row["policy_version"] == row["iteration"]
 
 
+def test_the_realised_change_of_cost_is_that_since_the_iteration_that_trained_the_policy(
+    tiny: Trained, in_turn: Run
+) -> None:
+    for run in (tiny.run, in_turn):  # that is the iteration before, in a pipelined run the one before that
+        rows = tables.read(run, "iterations").sort_by("iteration").to_pylist()
+        assert {row["policy_version"] for row in rows} >= {0, 1}
+        for row in rows:
+            version = row["policy_version"]
+            assert row["realised_cost_change"] == (row["cost"] - rows[version - 1]["cost"] if version else None)
+
+
 def test_an_evaluation_is_noise_free_repeatable_and_kept(tiny: Trained, tmp_path: Path) -> None:
     latest = checkpoint.load_latest(tiny.run.checkpoints)
     assert latest is not None

@@ -333,3 +333,17 @@ if __name__ == "__main__":
     with PyBulletEngine(ROBOT) as fresh_engine:
         fresh_engine.set_ground(chosen)
         print(_digest(chosen, fresh_engine))
+
+
+def test_a_robot_on_rough_ground_comes_back_from_branches_with_its_contacts() -> None:
+    way, other = _commands(30), _commands(10, seed=1)
+    with PyBulletEngine(ROBOT) as engine, PyBulletEngine(ROBOT) as undisturbed:
+        for each in (engine, undisturbed):
+            each.set_ground(ROUGH)
+            each.reset(neutral_state(ROBOT).but(bar_positions=neutral_state(ROBOT).bar_positions + [0, 0, 1.5]))
+        for number, command in enumerate(way):
+            if number % 10 == 5:
+                with engine.branching() as back:
+                    ends = [[engine.control_step(each) for each in other] for _ in range(2) if back() is None]
+                assert np.array_equal(_numbers(ends[0][-1]), _numbers(ends[1][-1]))
+            assert np.array_equal(_numbers(engine.control_step(command)), _numbers(undisturbed.control_step(command)))
