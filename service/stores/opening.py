@@ -7,14 +7,16 @@ from pathlib import Path
 
 from t6gps.service.stores.local import LocalStore
 from t6gps.service.stores.store import Store
+from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
 
 
 def open_store(root: str | PathLike[str] = "runs") -> Store:
-    """The store of a root: a folder, or the address of a server such as "https://gps.example.org:8686".
+    """The store of a root: a folder, s3://BUCKET/PREFIX, or a server's address such as "https://gps.example.org:8686".
 
-    A server is asked with the token of T6GPS_TOKEN. RunError for a folder that is not there, ServerError for an address
-    that is none, ConfigError where the client of servers is not installed.
+    A server is asked with the token of T6GPS_TOKEN, an object store with the keys of AWS_*. RunError for a folder that
+    is not there, ServerError for an address that is none, StoreError for an object store that refuses or is away,
+    ConfigError where the client of either is not installed, or keys are missing.
     """
     place = fspath(root)
     if place.startswith(("http://", "https://")):
@@ -25,6 +27,7 @@ def open_store(root: str | PathLike[str] = "runs") -> Store:
                 f"the store of a server needs {error.name}; install it with: pip install 't6gps[server]'"
             ) from None
         return far.of(place)
-    if not Path(place).expanduser().is_dir():
+    folder = catalog.whole(Path(place))
+    if not folder.is_dir():
         raise RunError(f"there is no folder {place} that could hold runs; train a first one, or give another root")
-    return LocalStore(Path(place))
+    return LocalStore(folder)
