@@ -14,6 +14,7 @@ import pyarrow as pa
 
 from t6gps.storage import durable, fields, ipc, schema
 from t6gps.storage.errors import DataError
+from t6gps.storage.objects import place
 from t6gps.storage.records import Episode
 
 _log = logging.getLogger(__name__)
@@ -46,7 +47,8 @@ def checked(episode: Episode, iteration: int) -> Episode:
 
 def read(path: Path) -> Episode:
     """The episode in a file of a spool; its tables lie in the file. ArrowException or OSError when it is torn."""
-    return Episode(*ipc.unpack(pa.memory_map(str(path)), 2))
+    source = pa.BufferReader(path.read_bytes()) if place.is_object(path) else pa.memory_map(str(path))
+    return Episode(*ipc.unpack(source, 2))
 
 
 class Spool:

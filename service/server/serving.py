@@ -13,6 +13,7 @@ from pathlib import Path
 import uvicorn
 
 from t6gps.service.server import app, tokens
+from t6gps.service.server.patience import Patient
 from t6gps.storage import catalog
 from t6gps.storage.errors import ServerError
 
@@ -52,7 +53,7 @@ def serve(root: Path, address: Address, say: Callable[[str], object]) -> None:
             ssl_certfile=str(address.cert) if secured else None,
             ssl_keyfile=str(address.key) if secured else None,
             loop="uvloop",
-            http="httptools",
+            http=Patient,
             ws="none",
             lifespan="off",
             log_level="warning",

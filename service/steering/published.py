@@ -34,8 +34,7 @@ def write(run: Run, written: Written) -> None:
     """Replace what is said of a run, in one step."""
     path = run.pool / "published.json"
     path.parent.mkdir(exist_ok=True)
-    durable.hidden(path).write_text(json.dumps(written) + "\n")
-    durable.hidden(path).replace(path)
+    durable.replace(path, f"{json.dumps(written)}\n".encode())
 
 
 def standing(run: Run) -> Published | None:

@@ -18,7 +18,7 @@ def open_store(root: str | PathLike[str] = "runs") -> Store:
     is not there, ServerError for an address that is none, StoreError for an object store that refuses or is away,
     ConfigError where the client of either is not installed, or keys are missing.
     """
-    place = fspath(root)
+    place = str(root) if isinstance(root, Path) else fspath(root)
     if place.startswith(("http://", "https://")):
         try:
             from t6gps.service.stores import far

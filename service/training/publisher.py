@@ -15,7 +15,7 @@ from pathlib import Path
 
 from t6gps.service.steering import published
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import StoreUnreachableError, T6GpsError
+from t6gps.storage.errors import RunError, StoreUnreachableError, T6GpsError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
 
@@ -51,12 +51,20 @@ def main() -> int:
 
 
 def _tell(run: Run, target: ObjectPath, error: Exception | None) -> None:
-    before = published.standing(run)
     try:
         there_n = publishing.iterations(target)
     except (T6GpsError, OSError):
+        before = _known(run)
         there_n = 0 if before is None or before["to"] != str(target) else before["iterations"]
     published.write(run, {"to": str(target), "iterations": there_n, "error": None if error is None else str(error)})
+
+
+def _known(run: Run) -> published.Published | None:
+    """What was said of the run, None also where a power failure has torn it."""
+    try:
+        return published.standing(run)
+    except RunError:
+        return None
 
 
 def _ended(timeout_s: float | None) -> bool:

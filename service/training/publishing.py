@@ -17,7 +17,7 @@ from t6gps.service.training import publisher
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, StoreUnreachableError
+from t6gps.storage.errors import ConfigError, RunError, StoreUnreachableError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
 
@@ -73,7 +73,10 @@ def beside(run: Run, root: ObjectPath | None, observer: Observer) -> Iterator[Ob
 
 
 def _tell_left(run: Run, root: ObjectPath) -> None:
-    known = published.standing(run)
+    try:
+        known = published.standing(run)
+    except RunError:  # the command below finds out
+        known = None
     all_n = publishing.iterations(run.path)
     there_n = all_n - known["behind"] if known else 0
     reason = f": {known['error']}" if known and known["error"] else ""
@@ -116,7 +119,11 @@ class _Process:
     def wake(self) -> None:
         """Say that something was committed; this does not wait."""
         if self._child.poll() is not None:
-            self._child = self._started()
+            try:
+                self._child = self._started()
+            except OSError as error:  # the run goes on, and tries again after the next iteration
+                _log.warning("nothing is published now, its process cannot be started: %s", error)
+                return
         assert self._child.stdin is not None, "it is a pipe"
         with suppress(BlockingIOError, BrokenPipeError):  # it has lines to read still, or has died just now
             os.write(self._child.stdin.fileno(), b"\n")

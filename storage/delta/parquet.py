@@ -64,8 +64,8 @@ def groups(file: Path, columns: list[str]) -> Iterator[pa.Table]:
 
 def row_groups(table: str, paths: list[str], wanted: pc.Expression) -> Iterator[pa.Table]:
     """The wanted rows of files, a row group at a time; groups that cannot have any are not read. Typed as `rows`."""
-    definition = schema.TABLES[table]
-    for fragment in ds.dataset(paths, definition, format=_VERIFIED).get_fragments():
+    definition, (file_system, found) = schema.TABLES[table], place.located(paths)
+    for fragment in ds.dataset(found, definition, format=_VERIFIED, filesystem=file_system).get_fragments():
         for group in fragment.split_by_row_group(wanted, definition):
             yield group.to_table(definition, filter=wanted)
 

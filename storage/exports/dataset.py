@@ -10,7 +10,6 @@ from __future__ import annotations
 
 import json
 import os
-import shutil
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -95,7 +94,7 @@ def _fill(
         place.mkdir(parents=True)
         for file in OF_RUN:
             if (source.run.path / file).exists():
-                shutil.copyfile(source.run.path / file, place / file)
+                (place / file).write_bytes((source.run.path / file).read_bytes())
     (folder / "README.md").write_text(card.card(name, form, asked, sources, totals), encoding="utf-8")
 
 

@@ -14,6 +14,7 @@ import json
 import mmap
 import secrets
 from collections.abc import Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
@@ -65,7 +66,8 @@ def probe(root: ObjectPath) -> None:
 
     answers(root)  # some stores make a bucket that is written to
     trial = root / f".probe-{secrets.token_hex(8)}"
-    _put(trial, b"1", created=True)
+    with suppress(FileExistsError):  # it was made, and the answer was lost
+        _put(trial, b"1", created=True)
     try:
         _put(trial, b"2", created=True)
     except FileExistsError:
@@ -232,11 +234,11 @@ def _sha256(content: bytes | mmap.mmap) -> str:
 
 
 def _forget_states(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
-    """Remove the checkpoints that the run itself has removed by now, their DONE first."""
+    """Remove the checkpoints that the run itself has removed by now, their DONE first, once a later one is there."""
     import obstore
 
-    kept = checkpoint.kept(run / "checkpoints")
-    first = f"checkpoints/{kept[min(kept)].name}/" if kept else ""
+    folders = (f"checkpoints/{path.name}/" for path in checkpoint.kept(run / "checkpoints").values())
+    first = min((folder for folder in folders if f"{folder}DONE" in there), default="")  # or else all would be gone
     old = sorted(file for file in there if file.startswith("checkpoints/") and file < first)
     with store.asking(target.bucket, str(target)):
         for file in old:

@@ -34,8 +34,7 @@ RETRIES_N, RETRY_S = 2, 10
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
 _CODE = re.compile(r"<Code>(\w+)</Code>")
 _STATUS = re.compile(r"status code: (\d{3})|HTTP status (\d{3})")
-PREFIX = "AWS_"
-"""Of the variables that say how the store is reached."""
+_PREFIX = "AWS_"
 _KEYS = ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY")
 
 
@@ -58,6 +57,11 @@ class Access:
     def plain(self) -> bool:
         """Whether http is spoken."""
         return self.endpoint is not None and self.endpoint.startswith("http:")
+
+
+def variables() -> dict[str, str]:
+    """The variables that say how the store is reached, for another process."""
+    return {name: value for name, value in os.environ.items() if name.startswith(_PREFIX)}
 
 
 def access() -> Access:

@@ -134,8 +134,9 @@ def _entered(run: Run) -> Whole | None:
                 return None
             found = _read(run)
             _write(run, draft, found)
-            for older in run.cache.glob("[!.]*"):
-                durable.discard(older)
+            entries = sorted(run.cache.glob("[!.]*"), key=lambda entry: entry.stat().st_mtime)
+            for entry in entries[:-1]:  # whoever asked a moment ago may yet read the last one
+                durable.discard(entry)
             durable.claim(draft, run.cache / state.key)
             return found
     except OSError as error:

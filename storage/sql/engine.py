@@ -7,11 +7,13 @@ from typing import TypeAlias, final
 
 import duckdb
 import pyarrow as pa
+from pyarrow import fs
 
 from t6gps.storage import schema
 from t6gps.storage.delta import parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.errors import QueryError
+from t6gps.storage.objects import place
 from t6gps.storage.sql import advice, views
 
 RunFiles: TypeAlias = dict[str, Files]
@@ -25,6 +27,15 @@ _LOCKED = (
 )
 
 
+def _stamps(of_runs: RunFiles) -> object:
+    """What differs where a file was replaced under its name; always, in an object store."""
+    paths = [path for of_run in of_runs.values() for path in of_run.paths]
+    file_system, found = place.located(paths)
+    if not isinstance(file_system, fs.LocalFileSystem):
+        return object()
+    return [(status.size, status.mtime_ns) for status in file_system.get_file_info(found)]
+
+
 @final
 class Engine:
     """A connection, with the tables that were shown to it last. It answers one question at a time.
@@ -34,17 +45,19 @@ class Engine:
 
     def __init__(self, settings: Mapping[str, int | str]) -> None:
         self._connection = duckdb.connect(":memory:", config=dict(settings))
-        self._shown: dict[str, RunFiles] = {}
+        self._shown: dict[str, tuple[RunFiles, object]] = {}
         self._runs: pa.Table | None = None
 
     def show(self, files: Mapping[str, RunFiles], runs: pa.Table) -> None:
         """Let it see the files of tables, by run, and the table `runs`. Tables that are not named stay as they are."""
         first = not self._shown
         for table in schema.TABLES:
-            of_runs = files.get(table, self._shown.get(table, {}))
-            if self._shown.get(table) != of_runs:
-                self._connection.register(table, parquet.rows_of_runs(table, of_runs))
-                self._shown[table] = of_runs
+            if table in files or first:
+                of_runs = files.get(table, {})
+                shown = of_runs, _stamps(of_runs)
+                if self._shown.get(table) != shown:
+                    self._connection.register(table, parquet.rows_of_runs(table, of_runs))
+                    self._shown[table] = shown
         if first or not runs.equals(self._runs):
             self._connection.register("runs", runs)
             self._runs = runs

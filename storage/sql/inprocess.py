@@ -14,7 +14,7 @@ from typing import final
 
 import pyarrow as pa
 
-from t6gps.storage.errors import DataError, QueryError
+from t6gps.storage.errors import DataError, QueryError, StoreError
 from t6gps.storage.sql import advice, cache, engine, formats, query, sandbox, views
 from t6gps.storage.sql.engine import Engine, RunFiles
 from t6gps.storage.sql.query import Question
@@ -52,11 +52,11 @@ class InProcess:
 
 def _explained(
     error: Exception, question: Question, files: Mapping[str, RunFiles], about: pa.Table
-) -> QueryError | DataError:
-    if damage := sandbox.fault(error):
+) -> QueryError | DataError | StoreError:
+    if damage := sandbox.fault(error, files):
         if cache.forget_torn(question.runs):
             return QueryError("what was kept for queries below the root was damaged and is removed; ask again")
-        return query.damaged(question.runs, files, *damage)
+        return query.damaged(question.runs, *damage)
     return QueryError(advice.explained(error, question.sql, views.asked(about.schema)))
 
 

@@ -23,6 +23,7 @@ from dataclasses import dataclass
 from pathlib import Path
 
 from t6gps.storage.sql import sandbox
+from t6gps.storage.sql.sandbox import REFUSED
 
 ENVIRONMENT = {
     # Allocators that reserve address space per thread would eat a child's bound before its query starts.
@@ -55,29 +56,43 @@ def main(owner: socket.socket) -> None:
     gc.freeze()  # else each child would copy what the collector touches
     with selectors.DefaultSelector() as ready:
         ready.register(owner, selectors.EVENT_READ)
-        while True:
-            for key, _ in ready.select():
-                child: _Child | None = key.data
-                if child is None:
-                    content, files, _, _ = socket.recv_fds(owner, 1, FILES_N)
-                    if not content:
-                        _kill_all(ready)
-                        return
-                    _start(ready, files)
-                elif ready.get_map().get(key.fd) is not key:  # its other event came first
-                    continue
-                elif key.fileobj is child.line:  # who asked has gone
-                    ready.unregister(child.line)
-                    signal.pidfd_send_signal(child.handle, signal.SIGKILL)
-                else:
-                    _report(ready, child)
+        try:
+            _serve(ready, owner)
+        finally:
+            _kill_all(ready)
+
+
+def _serve(ready: selectors.BaseSelector, owner: socket.socket) -> None:
+    while True:
+        for key, _ in ready.select():
+            child: _Child | None = key.data
+            if child is None:
+                content, files, _, _ = socket.recv_fds(owner, 1, FILES_N)
+                if not content:
+                    return
+                _start(ready, files)
+            elif ready.get_map().get(key.fd) is not key:  # its other event came first
+                continue
+            elif key.fileobj is child.line:  # who asked has gone
+                ready.unregister(child.line)
+                signal.pidfd_send_signal(child.handle, signal.SIGKILL)
+            else:
+                _report(ready, child)
 
 
 def _start(ready: selectors.BaseSelector, files: Sequence[int]) -> None:
-    pid = os.fork()
-    if not pid:
-        os._exit(_answered(files[:3]))
     *own, line = files
+    try:
+        pid = os.fork()
+    except OSError as error:  # no room for another process: the others go on
+        os.write(own[2], f"no process can be started for the query: {error.strerror}; ask again later".encode())
+        with socket.socket(fileno=line) as asker, suppress(BrokenPipeError, ConnectionResetError):
+            asker.send(REFUSED.to_bytes(STATUS_BYTES_N))
+        for file in own:
+            os.close(file)
+        return
+    if not pid:
+        os._exit(_answered(own))
     for file in own:
         os.close(file)
     child = _Child(pid, os.pidfd_open(pid), socket.socket(fileno=line))

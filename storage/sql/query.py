@@ -10,7 +10,6 @@ from __future__ import annotations
 import io
 import json
 import mmap
-import os
 import shutil
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
@@ -22,10 +21,9 @@ import pyarrow as pa
 
 from t6gps.storage import tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.delta import log, parquet
-from t6gps.storage.delta.parquet import Files
+from t6gps.storage.delta import log
 from t6gps.storage.errors import DataError, QueryError, StoreError, T6GpsError
-from t6gps.storage.objects import store
+from t6gps.storage.objects import place, store
 from t6gps.storage.sql import cache, sandbox, views, warm
 from t6gps.storage.sql.engine import RunFiles
 
@@ -130,7 +128,7 @@ def _answered(question: Question, form: str) -> BinaryIO:
             words.seek(0)
             message = words.read(_WORDS_BYTES_N).decode(errors="replace").strip()
             if status == sandbox.DAMAGED:
-                raise damaged(question.runs, files, *json.loads(message))
+                raise damaged(question.runs, *json.loads(message))
             raise QueryError(_reason(status, message))
         result.seek(0)
         stack.pop_all()  # it stays open
@@ -168,7 +166,7 @@ def _line(question: Question, form: str, files: Mapping[str, RunFiles]) -> bytes
         "form": form,
         "files": {table: {run: asdict(found) for run, found in of_runs.items()} for table, of_runs in files.items()},
         "timeout_s": question.timeout_s,
-        "environment": {name: value for name, value in os.environ.items() if name.startswith(store.PREFIX)},
+        "environment": store.variables() if any(place.is_object(run.path) for run in question.runs) else {},
     }
     return json.dumps(sent).encode() + b"\n"
 
@@ -180,16 +178,14 @@ def _stream(table: pa.Table) -> bytes:
     return sink.getvalue()
 
 
-def damaged(runs: Sequence[Run], files: Mapping[str, RunFiles], table: str, why: str) -> DataError:
-    """The error for a table that cannot be read to its end. It names the run, which the query's process cannot."""
-    for run in runs:
-        try:
-            with log.readable(run, table):
-                for _ in parquet.rows(table, files[table].get(run.name, Files([]))).to_batches():
-                    pass
-        except DataError as error:
-            return error
-    return log.damaged(runs[0], table, why)
+def damaged(runs: Sequence[Run], table: str, name: str, why: str) -> DataError | StoreError:
+    """The error for a table of a run that cannot be read to its end."""
+    run = next(run for run in runs if run.name == name)
+    try:
+        with log.readable(run, table):
+            raise OSError(why)
+    except (DataError, StoreError) as error:
+        return error
 
 
 def check_size(sql: str) -> None:

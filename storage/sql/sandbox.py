@@ -21,8 +21,10 @@ from typing import Any
 import duckdb
 import pyarrow as pa
 
+from t6gps.storage.delta import parquet
 from t6gps.storage.delta.parquet import Files
 from t6gps.storage.sql import advice, engine, formats, views
+from t6gps.storage.sql.engine import RunFiles
 
 RESULT_BYTES_N = 10**9
 MEMORY_BYTES_N = 2 * 1024**3
@@ -30,6 +32,7 @@ REFUSED, TOO_LARGE, DAMAGED = 2, 3, 4
 
 _FAULT = re.compile(r"Invalid Input Error: reading the stream registered as '(\w+)' failed: (.*)")
 """What DuckDB says of a table that pyarrow cannot read: its name, and why."""
+_REASON_LENGTH_N = 300
 _THREADS_N = 2
 _SETTINGS: Mapping[str, int | str] = {"threads": _THREADS_N, "memory_limit": "1GB"}
 _GRACE_S = 5
@@ -52,10 +55,23 @@ def limit(timeout_s: float) -> None:
     signal.setitimer(signal.ITIMER_REAL, timeout_s + _GRACE_S)  # which ends it, in whatever library it is
 
 
-def fault(error: Exception) -> tuple[str, str] | None:
-    """The table that could not be read to its end, and why, where that is what a query ended with."""
-    found = _FAULT.match(str(error))
-    return None if found is None else (found[1], found[2])
+def fault(error: Exception, files: Mapping[str, RunFiles]) -> tuple[str, str, str] | None:
+    """The table and the run that cannot be read to their end, and why, where a query says that it met such a table.
+
+    None where they can be read after all: SQL may raise any text as an error, and memory or a network may be short.
+    """
+    said = _FAULT.match(str(error))
+    if said is None:
+        return None
+    for run, of_run in files.get(said[1], {}).items():
+        try:
+            for _ in parquet.rows(said[1], of_run).to_batches():
+                pass
+        except MemoryError:
+            return None
+        except (pa.ArrowException, OSError) as reason:
+            return said[1], run, str(reason)[:_REASON_LENGTH_N]
+    return None
 
 
 def answer() -> int:
@@ -64,13 +80,16 @@ def answer() -> int:
     pa.set_io_thread_count(_THREADS_N)
     question, runs = _asked()
     os.environ.update(question["environment"])
+    files = {
+        table: {run: Files(**found) for run, found in of_runs.items()} for table, of_runs in question["files"].items()
+    }
     try:
         with open(1, "wb", closefd=False) as result:  # its last bytes may not fit either
-            formats.write(_relation(question, runs), question["form"], result)
+            formats.write(_relation(question, files, runs), question["form"], result)
     except engine.ERRORS as error:
         if isinstance(error, OSError) and error.errno == errno.EFBIG:
             return TOO_LARGE
-        damage = fault(error)
+        damage = fault(error, files)
         words = json.dumps(damage) if damage else advice.explained(error, question["sql"], views.asked(runs.schema))
         with open(2, "w", encoding="utf-8", errors="backslashreplace") as told:
             told.write(words)
@@ -78,11 +97,8 @@ def answer() -> int:
     return 0
 
 
-def _relation(question: Mapping[str, Any], runs: pa.Table) -> duckdb.DuckDBPyRelation:
+def _relation(question: Mapping[str, Any], files: Mapping[str, RunFiles], runs: pa.Table) -> duckdb.DuckDBPyRelation:
     connection = engine.Engine(_SETTINGS)
-    files = {
-        table: {run: Files(**found) for run, found in of_runs.items()} for table, of_runs in question["files"].items()
-    }
     connection.show(files, runs)
     limit(question["timeout_s"])
     return connection.ask(question["sql"], question["parameters"])

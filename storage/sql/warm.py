@@ -14,6 +14,7 @@ import threading
 from typing import BinaryIO, final
 
 from t6gps.storage.errors import QueryError
+from t6gps.storage.objects import store
 from t6gps.storage.sql import nursery
 
 STOP_S = 5.0
@@ -37,7 +38,7 @@ class Nursery:
                 stdout=subprocess.DEVNULL,
                 stderr=self._words,
                 cwd="/",
-                env={**os.environ, **nursery.ENVIRONMENT},
+                env={**_without_keys(), **nursery.ENVIRONMENT},
             )
         atexit.register(self.close)
 
@@ -95,6 +96,11 @@ class Nursery:
             "the process that starts queries has ended, most likely for want of memory; ask again, with more memory "
             f"free; its last words: {self._said.splitlines()[-1] if self._said else 'none'}"
         )
+
+
+def _without_keys() -> dict[str, str]:
+    """The variables of this process but for those of object stores, which questions about them bring along."""
+    return {name: value for name, value in os.environ.items() if name not in store.variables()}
 
 
 _starting = threading.Lock()

@@ -9,6 +9,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
 from pathlib import Path as Folder
+from queue import SimpleQueue
 from typing import Annotated, TypeAlias, cast, final
 
 from fastapi import Depends, HTTPException, Path, Request
@@ -88,20 +89,22 @@ class Shares:
     def __init__(self, most_n: int, of_token_n: int) -> None:
         self._most_n, self._of_token_n = most_n, of_token_n
         self._taken: Counter[str] = Counter()
+        self._returned: SimpleQueue[str] = SimpleQueue()
         self._lock = threading.Lock()
 
     def take(self, token: Token) -> None:
         """Take a slot for a token. HTTPException where there is none for it."""
         with self._lock:
+            while not self._returned.empty():
+                self._taken[self._returned.get()] -= 1
+            self._taken = +self._taken
             if self._taken.total() >= self._most_n or self._taken[token.id] >= self._of_token_n:
                 raise HTTPException(HTTPStatus.SERVICE_UNAVAILABLE, BUSY, {"Retry-After": "1"})
             self._taken[token.id] += 1
 
     def give_back(self, token: Token) -> None:
-        """Give it back."""
-        with self._lock:
-            self._taken[token.id] -= 1
-            self._taken = +self._taken
+        """Give it back; without a lock, since the collector of garbage may do so at any moment."""
+        self._returned.put(token.id)
 
     @contextmanager
     def taken(self, token: Token) -> Iterator[None]:

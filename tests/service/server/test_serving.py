@@ -13,6 +13,7 @@ import sys
 from collections.abc import Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from urllib.parse import urlsplit
 
 import httpx
 import pytest
@@ -21,6 +22,7 @@ from loopback import Server
 
 from t6gps.service import config as configuration
 from t6gps.service.remote.messages import Scope
+from t6gps.service.server import patience
 from t6gps.storage import catalog
 
 
@@ -56,6 +58,21 @@ def test_it_serves_without_a_run_and_ends_quietly_when_it_is_told_to(tmp_path: P
     assert process.returncode == 0
     assert "ended" in last
     assert "Traceback" not in last
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "sent", [b"", b"GET /v1/health HT", b"GET /v1/health HTTP/1.1\r\nHost: localhost\r\n\r\nGET /"]
+)
+def test_a_connection_whose_request_does_not_come_is_closed(tmp_path: Path, sent: bytes) -> None:
+    with serving(tmp_path) as (_, url):
+        found = urlsplit(url)
+        with socket.create_connection((found.hostname, found.port), timeout=patience.HEAD_S + 30) as silent:
+            silent.sendall(sent)
+            answered = b""
+            while more := silent.recv(65536):
+                answered += more
+    assert (b"200 OK" in answered) == (b"Host" in sent)
 
 
 @pytest.fixture(scope="module")

@@ -3,11 +3,15 @@
 from __future__ import annotations
 
 import pickle
+import shutil
 from pathlib import Path
 from typing import Any
 
+import pyarrow.compute as pc
 import pytest
+import synthetic
 
+from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, QueryError, T6GpsError
 from t6gps.storage.sql import inprocess
@@ -34,6 +38,18 @@ def test_an_answer_is_that_of_the_sandbox_and_knows_each_new_commit(run: Run, co
         assert inprocess.ask(Question([run], SUMS)).equals(found), "to the last bit"
     sql = "SELECT s.*, r.run, $a AS a FROM segments s JOIN runs r USING (run) ORDER BY ALL"
     assert inprocess.ask(Question([run], sql, {"a": 3})).equals(query(Question([run], sql, {"a": 3})))
+
+
+def test_a_run_that_was_replaced_under_its_name_is_the_new_one(run: Run, commit: Any) -> None:
+    totals = []
+    for change in (commit, synthetic.commit):
+        shutil.rmtree(run.path)
+        made = catalog.create(run.path.parent, run.name, "{}")
+        change(made, 0)
+        (total,) = inprocess.ask(Question([made], "SELECT sum(cost) AS cost FROM frames"))["cost"].to_pylist()
+        assert total == pytest.approx(pc.sum(tables.read(made, "frames")["cost"]).as_py())
+        totals.append(total)
+    assert totals[0] != pytest.approx(totals[1])
 
 
 @pytest.mark.parametrize(

@@ -83,6 +83,13 @@ def test_a_byte_that_has_changed_in_a_page_names_its_run(runs: list[Run]) -> Non
         query(Question(runs, "SELECT sum(cost) AS cost FROM frames", left_out=pytest.fail))
 
 
+@pytest.mark.parametrize("table", ["frames", "nothing"])
+def test_no_text_that_sql_raises_counts_as_damage(runs: list[Run], table: str) -> None:
+    sql = f"SELECT error('reading the stream registered as ''{table}'' failed: ' || run) FROM frames"
+    with pytest.raises(QueryError, match="reading the stream registered as"):
+        query(Question(runs, sql))
+
+
 def test_a_pattern_finds_runs_and_a_wrong_one_the_nearest(runs: list[Run]) -> None:
     root = runs[0].path.parent
     assert catalog.matching(root, "rough-*") == runs[1:]
