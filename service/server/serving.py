@@ -52,7 +52,7 @@ def serve(root: Path, address: Address, say: Callable[[str], object]) -> None:
             app.create(root, allowed, scheme),
             ssl_certfile=str(address.cert) if secured else None,
             ssl_keyfile=str(address.key) if secured else None,
-            loop="uvloop",
+            loop="asyncio",
             http=Patient,
             ws="none",
             lifespan="off",
