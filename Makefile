@@ -23,7 +23,7 @@ $(STAMP): pyproject.toml $(wildcard */native/*.[ch] */*/native/*.[ch] */*/*/nati
 train: install
 	$(BIN)/t6gps train flat-quick
 
-# All tests, twenty minutes on two cores; then those that need neither Ray nor a trained run, three minutes.
+# All tests, some 25 minutes on two cores; then those that need neither Ray nor a trained run, four and a half.
 test: install
 	$(BIN)/pytest $(SPREAD)
 
