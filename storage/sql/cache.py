@@ -1,6 +1,6 @@
 """What queries over many runs need of each, kept below the root: ROOT/.cache/NAME/KEY.
 
-A run has a table's file for each iteration, and logs to read before them: 40 ms a run. An entry of the cache has the
+A run has a table's file for each iteration, and logs to read before them. An entry of the cache has the
 names of all files, and the rows of small tables in one file. Its KEY covers name, size, times and inode of everything
 in RUN/tables, so an entry of other tables is never found. It may be deleted at any time.
 """

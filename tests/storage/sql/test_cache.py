@@ -47,7 +47,7 @@ def make(root: Path, commit: Any) -> Callable[..., None]:
         deadline = time.monotonic() + DEADLINE_S
         while not all(kept(run) for run in catalog.list_runs(root)):
             assert time.monotonic() < deadline, "the cache does not take runs that nobody changes"
-            time.sleep(0.1)
+            time.sleep(0.1)  # the file system's clock brings it about: there is nothing to wait on but that
             ask(root)
 
     return settled
