@@ -6,8 +6,8 @@ of it is kept.
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
-from typing import Protocol
+from collections.abc import Iterable, Mapping, Sequence
+from typing import NamedTuple, Protocol
 
 import numpy as np
 import pyarrow as pa
@@ -22,6 +22,13 @@ BLOCK_BYTES = 2**26
 Blocks of more than 32 MB come from the operating system and go back to it, while smaller ones may leave holes in the
 heap. Pages that nothing was written to cost nothing.
 """
+
+
+class Joined(NamedTuple):
+    """Episodes one under another: columns of all rows, and where their segments lie."""
+
+    columns: Columns
+    pieces: Pieces
 
 
 class Reading(Protocol):
@@ -76,8 +83,8 @@ class Episodes:
         self._columns.clear()
         self._pieces.clear()
 
-    def joined(self) -> tuple[Columns, Pieces]:
-        """Columns of all rows and pieces of all segments, episodes in ascending order of their ids.
+    def joined(self) -> Joined:
+        """All episodes in ascending order of their ids.
 
         No episode is left after it. DataError when there is no episode, or none has a control step.
         """
@@ -92,7 +99,16 @@ class Episodes:
             raise DataError(
                 f"none of the {len(arrived)} episodes has a single control step; there is nothing to learn from"
             )
-        return columns, pieces
+        return Joined(columns, pieces)
+
+
+def together(iterations: Sequence[Joined]) -> Joined:
+    """The episodes of at least one iteration, one iteration under another."""
+    if len(iterations) == 1:
+        return iterations[0]
+    names = iterations[0].columns
+    columns = {name: np.concatenate([each.columns[name] for each in iterations]) for name in names}
+    return Joined(columns, join([each.pieces for each in iterations]))
 
 
 class _Blocks:

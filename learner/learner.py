@@ -11,6 +11,7 @@ for done, total in learner.supervise(): ...         learner.snapshot is now the 
 
 from __future__ import annotations
 
+from collections import deque
 from collections.abc import Callable, Generator, Iterable, Iterator, Mapping
 from dataclasses import dataclass, replace
 from functools import partial
@@ -26,10 +27,10 @@ from t6gps.learner.algorithm.local_models import ClassJob, ClassModel
 from t6gps.learner.algorithm.model_series import patch
 from t6gps.learner.algorithm.modes import FitOptions, Search, ransac
 from t6gps.learner.algorithm.pairs import Pairs, Several
-from t6gps.learner.algorithm.segments import classify, group
+from t6gps.learner.algorithm.segments import Pieces, classify, group
 from t6gps.learner.alternatives import localization, mixtures, standard_gps
 from t6gps.learner.checkpoint import Carried
-from t6gps.learner.episodes import Episodes, Reading, RowReading
+from t6gps.learner.episodes import Episodes, Joined, Reading, RowReading, together
 from t6gps.learner.exploration import exploration
 from t6gps.learner.improvers import improver, transitions
 from t6gps.learner.improvers.action_value import ActionValue
@@ -38,7 +39,8 @@ from t6gps.learner.improvers.leading import leading
 from t6gps.learner.phases import PHASES
 from t6gps.learner.port import LearnerState, Manifest, Progress, Report, Task
 from t6gps.learner.report import Fitted, Iteration, Segmented, Trained, kl, report
-from t6gps.learner.rows import AnyArray, Floats, Rows, pieces
+from t6gps.learner.rows import AnyArray, Floats, Rows
+from t6gps.learner.rows import pieces as row_pieces
 from t6gps.learner.settings import LearnerSettings, Localization, ModeSearch
 from t6gps.learner.streams import Stream, branch, generator
 from t6gps.storage import schema, tables
@@ -85,9 +87,9 @@ class Learner:
         self._rows: RowReading = (
             standard_gps.InWorld(task.world_labels) if in_world else Canonical(settings.reduced_state)
         )
-        self._motion = transitions.Motion(task.mirrored)
-        readings: list[Reading] = [self._rows, *([self._motion] if self._value else [])]
+        readings: list[Reading] = [self._rows, *([transitions.Motion(task.mirrored)] if self._value else [])]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
+        self._earlier: deque[Joined] = deque(maxlen=settings.action_value.improved_iterations - 1)
         self.done = Done()
 
     def _rng(self, stream: Stream, round_: int = 0) -> np.random.Generator:
@@ -120,17 +122,16 @@ class Learner:
     def segment(self) -> Progress:
         """Join the segments of all episodes and classify them (lines 3 to 5)."""
         self.done = Done()
-        columns, places = self._episodes.joined()
-        rows = self._rows.rows(columns)
+        newest = self._episodes.joined()
         if self._value:
-            self._value.add(transitions.of_columns(columns, self._task.reach_m))
+            self._value.add(transitions.of_columns(newest.columns, self._task.reach_m))
+        known = together([*self._earlier, newest]) if self._led_by_value else newest
+        self._earlier.append(newest)
+        rows = self._rows.rows(known.columns)
         if self._led_by_value and self._settings.models_share:
-            rows = transitions.with_reach(rows, columns["rest_lengths"], self._task.reach_m)
+            rows = transitions.with_reach(rows, known.columns["rest_lengths"], self._task.reach_m)
         yield 1, 2
-        segments = classify(rows, places)
-        segmented = self._settings.localization in SEGMENTED
-        groups = group(segments, self._settings.smallest_class_segments) if segmented else []
-        self.done.segmented = Segmented(rows, segments, groups)
+        self.done.segmented = _segmented(rows, known.pieces, known.pieces.rows_n - newest.pieces.rows_n, self._settings)
         yield 2, 2
 
     def fit(self) -> Progress:
@@ -201,9 +202,12 @@ class Learner:
             return
         newest, remembered_n = self.snapshot.version, self._settings.action_value.remembered_iterations
         for iteration in range(max(newest - remembered_n + 1, 0), newest):
-            episodes = tables.frames_of(run, iteration, transitions.COLUMNS)
-            self._value.add(transitions.recalled(episodes, self._motion, self._task.reach_m))
+            for episode in tables.episodes_of(run, iteration, transitions.COLUMNS):
+                self.add(episode.frames, episode.noise_std_m)
+            earlier = self._episodes.joined()
+            self._value.add(transitions.of_columns(earlier.columns, self._task.reach_m))
             self._value.file_away()
+            self._earlier.append(earlier)
 
 
 @dataclass
@@ -221,6 +225,13 @@ def _of(result: Result | None, phase: str) -> Result:
         names = ", ".join(phase.name for phase in PHASES)
         raise RunError(f"{phase}() must come first; an iteration runs {names}")
     return result
+
+
+def _segmented(rows: Rows, pieces: Pieces, first: int, settings: LearnerSettings) -> Segmented:
+    """Rows with their segments and the groups of these; those of the iteration at work begin at row `first`."""
+    segments = classify(rows, pieces)
+    by_class = settings.localization in SEGMENTED
+    return Segmented(rows, segments, group(segments, settings.smallest_class_segments) if by_class else [], first)
 
 
 def fit_plans(
@@ -242,7 +253,7 @@ def _learned(improved: Improved, rows: Rows) -> Floats:
 def _divergence(snapshot: PolicySnapshot, rows: Rows, seen: Floats, command_range_m: tuple[float, float]) -> Floats:
     """KL divergence of a policy from the one that acted [n] (nat), both with the noise of the row's episode."""
     explored, divergence = exploration(rows, rows.acts), np.empty(len(rows.acts), dtype=np.float32)
-    for part in pieces(np.arange(len(rows.acts))):
+    for part in row_pieces(np.arange(len(rows.acts))):
         mean = np.clip(policy.act(snapshot, seen[part]), *command_range_m)
         if rows.labels is not None:
             mean = standard_gps.to_world(mean, rows.labels[part])

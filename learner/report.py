@@ -17,17 +17,26 @@ from t6gps.learner.algorithm.segments import ClassKey, SegmentGroup, Segments
 from t6gps.learner.exploration import Exploration
 from t6gps.learner.improvers.improver import Improved
 from t6gps.learner.port import Report, Row
-from t6gps.learner.rows import NONE, Floats, Ints, Rows, pieces, root_mean_square
+from t6gps.learner.rows import NONE, Flags, Floats, Ints, Rows, pieces, root_mean_square
 from t6gps.storage.schema import MODELS
 
 
 @dataclass(frozen=True)
 class Segmented:
-    """Rows of all episodes [n], their segments, and the groups of segments that share models."""
+    """Rows of all episodes [n], their segments, and the groups of segments that share models.
+
+    first   row from which on they are of the iteration at work; those above are of iterations before
+    """
 
     rows: Rows
     segments: Segments
     groups: list[SegmentGroup]
+    first: int = 0
+
+    @property
+    def newest(self) -> Flags:
+        """The row is of the iteration at work [n]."""
+        return np.arange(len(self.rows.acts)) >= self.first
 
 
 @dataclass(frozen=True)
@@ -88,26 +97,26 @@ def kl(rows: Rows, part: Ints, action_mean: Floats, explored: Exploration) -> Fl
 def _iteration_row(results: Iteration, command_range_m: tuple[float, float]) -> Row:
     rows, improved, loss = results.segmented.rows, results.improved, results.trained.loss
     modes = np.concatenate([fit.modes[fit.modes > 0] for fit in results.fitted.fits.values()])
-    sampled = np.flatnonzero(rows.continues)
+    newest, segments = results.segmented.newest, results.segmented.segments
+    sampled = np.flatnonzero(rows.continues & newest)
     return {
-        "segments": len(results.segmented.segments.start),
+        "segments": int(newest[segments.start].sum()),
         "classes": sum(not group.pooled for group in results.segmented.groups),
         "modes": float(modes.mean()),
         "residual": float(np.nanmean(results.fitted.series.residual)),
         "sub_trajectories": improved.sub_trajectories,
-        "predicted_cost_change": _mean(improved.predicted_cost_change[rows.continues]),
+        "predicted_cost_change": _mean(improved.predicted_cost_change[sampled]),
         "action_change_m": root_mean_square(sampled, lambda part: improved.action[part] - rows.action_mean[part]),
         "supervised_loss_before": loss.before,
         "supervised_loss": loss.after,
-        "policy_kl": _mean(results.trained.kl[rows.acts]),
-        "saturated_share": _saturated_share(rows, command_range_m),
+        "policy_kl": _mean(results.trained.kl[rows.acts & newest]),
+        "saturated_share": _saturated_share(rows, np.flatnonzero(rows.acts & newest), command_range_m),
     }
 
 
-def _saturated_share(rows: Rows, command_range_m: tuple[float, float]) -> float:
-    """Share of noise-free commands at an end of the command range."""
-    low, high = np.asarray(command_range_m, dtype=np.float32)
-    acting, saturated_n = np.flatnonzero(rows.acts), 0
+def _saturated_share(rows: Rows, acting: Ints, command_range_m: tuple[float, float]) -> float:
+    """Share of noise-free commands at an end of the command range, in rows that act [m]."""
+    (low, high), saturated_n = np.asarray(command_range_m, dtype=np.float32), 0
     for part in pieces(acting):
         mean = rows.action_mean[part]
         saturated_n += int(((mean <= low) | (mean >= high)).sum())
@@ -115,16 +124,18 @@ def _saturated_share(rows: Rows, command_range_m: tuple[float, float]) -> float:
 
 
 def _class_rows(results: Iteration, cost_after: NDArray[np.floating]) -> list[Row]:
-    """The rows of `classes`, without the iteration."""
+    """The rows of `classes`, without the iteration: classes that have segments of it."""
+    newest = results.segmented.newest[results.segmented.segments.start]
     return [
-        _class_row(results, cost_after, number, key, members)
+        _class_row(results, cost_after, number, key, members[newest[members]])
         for number, group in enumerate(results.segmented.groups)
         for key, members in group.classes.items()
+        if newest[members].any()
     ]
 
 
 def _class_row(results: Iteration, cost_after: NDArray[np.floating], number: int, key: ClassKey, members: Ints) -> Row:
-    """The row of a class: segments `members` of the group of that number."""
+    """The row of a class: segments `members` of the iteration, in the group of that number."""
     rows, segments = results.segmented.rows, results.segmented.segments
     group, fit = results.segmented.groups[number], results.fitted.fits.get(number)
     lengths = segments.stop - segments.start

@@ -40,6 +40,9 @@ class ActionValueSettings(Settings):
     """The learned action value Q, and how actions climb it (docs/algorithm.md, "Action value")."""
 
     remembered_iterations: int = Field(3, ge=1, le=20, description="iterations whose transitions are learned from")
+    improved_iterations: int = Field(
+        1, ge=1, le=20, description="iterations whose rows its models, improved actions and pairs are of"
+    )
     discount: float = Field(0.95, ge=0.0, lt=1.0, description="gamma, per control step of 0.1 s")
     hidden_layers: HiddenLayers = Field((128, 128), description="tanh units per hidden layer of Q")
     critics: int = Field(1, ge=1, le=8, description="networks whose mean is Q")
@@ -104,6 +107,16 @@ class LearnerSettings(Settings):
             raise ValueError("models_share and rounds need an action value; set value_from to 1 or later")
         if self.models_share and self.reduced_state != "nodes":
             raise ValueError("models_share needs reduced_state = nodes, to which it adds the rest lengths")
+        return self
+
+    @model_validator(mode="after")
+    def _improves_what_it_remembers(self) -> "LearnerSettings":
+        of_value = self.action_value
+        if of_value.improved_iterations > of_value.remembered_iterations:
+            raise ValueError(
+                f"action_value.improved_iterations = {of_value.improved_iterations} is more than "
+                f"remembered_iterations = {of_value.remembered_iterations}; remember as many"
+            )
         return self
 
     @model_validator(mode="after")

@@ -124,24 +124,11 @@ def _unknown(run: Run, episode_id: int, evaluation_id: int | None) -> DataError:
     return DataError(f"{where} has no episode {episode_id}; its {there}")
 
 
-def frames_of(run: Run, iteration: int, columns: Sequence[str]) -> dict[int, pa.Table]:
-    """Columns of the frames of an iteration by episode, in ascending order."""
-    where = pc.field("iteration") == iteration
-    table = read(run, "frames", [*columns, "episode_id", "step"], where).sort_by(
-        [("episode_id", "ascending"), ("step", "ascending")]
-    )
-    numbers, first = np.unique(table.column("episode_id").to_numpy(), return_index=True)
-    lengths = np.diff(first, append=table.num_rows)
-    return {
-        int(number): table.slice(start, length).select(columns)
-        for number, start, length in zip(numbers, first.tolist(), lengths.tolist(), strict=True)
-    }
-
-
-def episodes_of(run: Run, iteration: int) -> list[Episode]:
-    """The episodes of an iteration with all their columns, in ascending order of their ids."""
-    where = pc.field("iteration") == iteration
-    frames = read(run, "frames", filter=where).sort_by([("episode_id", "ascending"), ("step", "ascending")])
+def episodes_of(run: Run, iteration: int, columns: Sequence[str] | None = None) -> list[Episode]:
+    """The episodes of an iteration in ascending order of their ids, with all columns of `frames` or some."""
+    where, order = pc.field("iteration") == iteration, ["episode_id", "step"]
+    wanted = None if columns is None else list(dict.fromkeys([*columns, *order]))
+    frames = read(run, "frames", wanted, where).sort_by([(name, "ascending") for name in order])
     summary = read(run, "episodes", filter=where).sort_by("episode_id")
     lengths = summary.column("steps").to_numpy() + 1
     first = np.cumsum(lengths) - lengths

@@ -29,6 +29,12 @@ _PARTS: dict[ReducedState, Sequence[str]] = {
     "nodes+cables": ("nodes", "rest_lengths"),
 }
 
+COLUMNS = (
+    *("face", "kind", "entry_edge", "exit_edge", "com_velocity", "nodes", "node_velocities", "rest_lengths"),
+    *("action", "action_mean", "target_direction", "observation"),
+)
+"""Columns of `frames` that are read, by one reduced state or another."""
+
 
 def whole_columns(reduced_state: ReducedState) -> dict[str, slice]:
     """Columns of `frames` that a reduced state has whole, and their place in it; lower nodes are half of a column."""

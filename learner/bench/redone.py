@@ -90,7 +90,8 @@ def by_action_value(
 
     Before the iteration `value_from` it is what the run would have learned, had it begun in the iteration asked for.
     """
-    surrogate, of_value = redone.surrogate, settings.action_value
+    surrogate = redone.surrogate
+    of_value = settings.action_value.model_copy(update={"improved_iterations": 1})
 
     def rng(at: int) -> np.random.Generator:
         return generator(run_seed, branch(at, Stream.ACTION_VALUE))
@@ -104,7 +105,7 @@ def by_action_value(
         _exhaust(value.learn(policy_of(at), rng(at)))
     newest = transitions_of(iteration)
     value.add(newest)
-    alone = settings.model_copy(update={"models_share": 0.0})
+    alone = settings.model_copy(update={"models_share": 0.0, "action_value": of_value})
     leading = ByActionValue(surrogate, value, policy_of(iteration), rng(iteration), command_range_m, alone)
     improving = improver.improve(redone.rows, leading, settings.horizon_steps, command_range_m)
     return Valued(value, newest, _result(improving))

@@ -103,46 +103,49 @@ class ActionValue:
             critic.step(before, wanted)
 
     def improved(self, snapshot: PolicySnapshot, farther: Floats | None = None, share: float = 0.0) -> Floats:
-        """u* [n, nu] (m) at the rows of the newest transitions.
+        """u* [n, nu] (m) at the rows of the newest `improved_iterations`.
 
         farther   another estimate of dQ/de [n, nu] (m/s), which makes up `share` of the slope that is climbed
         """
         torch.set_num_threads(1)
-        newest, act, settings = self._remembered[-1], _actor(snapshot), self._settings
+        known, act, settings = self._newest(), _actor(snapshot), self._settings
 
         def climb(rows: Ints) -> torch.Tensor:
-            inputs, rest_lengths = newest.take(rows)
+            inputs, rest_lengths = known.take(rows)
             start = act(inputs)
             command = start.clone()
             others = None if farther is None else torch.from_numpy(farther[rows]).mul_(share)
             for _ in range(settings.ascents):
-                inputs[:, MOVED] = _moved(command, rest_lengths, newest.reach_m)
+                inputs[:, MOVED] = _moved(command, rest_lengths, known.reach_m)
                 slope = self.gradient(inputs)
                 if others is not None:
                     slope = slope.mul_(1 - share).add_(others)
-                wanted = start + settings.step_weight * _of_commands(slope, inputs, newest.reach_m)
+                wanted = start + settings.step_weight * _of_commands(slope, inputs, known.reach_m)
                 command += settings.ascent_rate * (wanted - command)
             return command
 
-        return _every_row(climb, len(newest.acts), MOVED.stop - MOVED.start)
+        return _every_row(climb, len(known.acts), MOVED.stop - MOVED.start)
 
     def state_slopes(self, snapshot: PolicySnapshot) -> Floats:
-        """dV/dx [n, nx] at the rows of the newest transitions, x = [velocity; nodes; rest lengths] (m/s per m/s, m).
+        """dV/dx [n, nx] at the same rows, x = [velocity; nodes; rest lengths] (m/s per m/s, m).
 
         V(x) = Q(s, e(u)) with the command u of a policy, held: rest lengths enter Q as a part of s, and through e.
         """
         torch.set_num_threads(1)
-        newest, act = self._remembered[-1], _actor(snapshot)
+        known, act = self._newest(), _actor(snapshot)
 
         def slopes(rows: Ints) -> torch.Tensor:
-            inputs, rest_lengths = newest.take(rows)
-            inputs[:, MOVED] = _moved(act(inputs), rest_lengths, newest.reach_m)
+            inputs, rest_lengths = known.take(rows)
+            inputs[:, MOVED] = _moved(act(inputs), rest_lengths, known.reach_m)
             of = self._gradient(inputs)
             by_rest = of[:, schema.REST_LENGTHS] / schema.REST_LENGTH_SCALE_M
-            by_rest -= _of_commands(of[:, MOVED], inputs, newest.reach_m)
+            by_rest -= _of_commands(of[:, MOVED], inputs, known.reach_m)
             return torch.hstack([of[:, VELOCITY], of[:, schema.NODES] / schema.NODE_SCALE_M, by_rest])
 
-        return _every_row(slopes, len(newest.acts), STATE_N)
+        return _every_row(slopes, len(known.acts), STATE_N)
+
+    def _newest(self) -> Transitions:
+        return joined(list(self._remembered)[-self._settings.improved_iterations :])
 
     def _mean_reward(self, known: Transitions, index: Ints) -> np.float32:
         """Mean reward over the rows after those that act [m]."""

@@ -9,7 +9,7 @@ from __future__ import annotations
 import os
 import tempfile
 import weakref
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
 from typing import Protocol
 
@@ -18,8 +18,8 @@ import pyarrow as pa
 import torch
 
 from t6gps.learner import policy
-from t6gps.learner.algorithm.features import acting, spread, vectors
-from t6gps.learner.episodes import Episodes
+from t6gps.learner.algorithm import features
+from t6gps.learner.algorithm.features import vectors
 from t6gps.learner.rows import VELOCITY_N, Columns, Flags, Floats, Ints, Rows, pieces
 from t6gps.storage import fields, schema
 from t6gps.storage.errors import RunError
@@ -33,7 +33,7 @@ INPUTS_N = sum(LENGTHS)
 """Entries of [s; e]."""
 MOVED = slice(INPUTS_N - ACTION_N, INPUTS_N)
 """Where e is among them."""
-COLUMNS = (*STATE, "action", "rest_lengths", "target_direction", "frame_yaw_rad", "element")
+COLUMNS = (*features.COLUMNS, "frame_yaw_rad", "element")
 """What a resumed run reads of `frames`."""
 HELD_ROWS = 2**18
 """Iterations of more rows are filed away when they are over; those of the paper (75,000) stay in memory."""
@@ -183,36 +183,13 @@ class Motion:
         }
 
 
-class Recalled:
-    """Reads what transitions need of an episode of an earlier iteration."""
-
-    def read(self, frames: pa.Table) -> Columns:
-        """What `of_columns` needs beside motion. DataError when any row but the last lacks an action."""
-        acts = acting(frames)
-        return {
-            "observation": vectors(frames, "observation"),
-            "state": vectors(frames, "com_velocity"),
-            "action": spread(vectors(frames, "action"), acts),
-            "starts": np.arange(len(acts)) == 0,
-            "acts": acts,
-        }
-
-
-def recalled(episodes: Mapping[int, pa.Table], motion: Motion, reach_m: float) -> Transitions:
-    """Transitions of an earlier iteration from its episodes, by their ids. DataError as from `Episodes`."""
-    taken = Episodes([Recalled(), motion], longest_segment_steps=2**31)  # segments are of no use here
-    for episode_id, frames in episodes.items():
-        taken.add(episode_id, frames)
-    return of_columns(taken.joined()[0], reach_m)
-
-
 def with_reach(rows: Rows, rest_lengths: Floats, reach_m: float) -> Rows:
     """Rows whose state has the rest lengths [n, nu] (m) as well, and whose models regress on what winches reach."""
     return replace(rows, state=np.hstack([rows.state, rest_lengths]), reach_m=reach_m)
 
 
 def of_columns(columns: Columns, reach_m: float) -> Transitions:
-    """Transitions of the columns that `Motion` and either `Recalled` or a reading of rows have found."""
+    """Transitions of the columns that `Motion` and a reading of rows have found."""
     velocity = np.ascontiguousarray(columns["state"][:, :VELOCITY_N])
     parts = columns["observation"], velocity, columns["node_velocities"], columns["action"]
     narrow = {name: columns[name] for name in ("turn", "side", "heading", "acts")}

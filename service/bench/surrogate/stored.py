@@ -10,8 +10,10 @@ from typing import NamedTuple
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.learner.algorithm.features import Canonical
 from t6gps.learner.bench import redone
 from t6gps.learner.bench.redone import Redone, Valued
+from t6gps.learner.episodes import Episodes
 from t6gps.learner.improvers import transitions
 from t6gps.learner.rows import Floats, Ints
 from t6gps.learner.settings import Localization
@@ -204,7 +206,10 @@ def _by_action_value(run: Run, config: Config, at: int, again: Redone, say: Say)
 
     def transitions_of(iteration: int) -> transitions.Transitions:
         say(f"the action value learns from iteration {iteration}")
-        return transitions.recalled(tables.frames_of(run, iteration, transitions.COLUMNS), motion, reach_m)
+        known = Episodes([Canonical(config.learner.reduced_state), motion], config.learner.longest_segment_steps)
+        for episode in tables.episodes_of(run, iteration, transitions.COLUMNS):
+            known.add(episode.episode_id, episode.frames)
+        return transitions.of_columns(known.joined().columns, reach_m)
 
     return redone.by_action_value(
         again,

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +12,8 @@ import pytest
 import torch
 
 from t6gps.learner import policy
+from t6gps.learner.algorithm.features import Canonical
+from t6gps.learner.episodes import Episodes
 from t6gps.learner.improvers import action_value, transitions
 from t6gps.learner.improvers.action_value import ActionValue
 from t6gps.learner.improvers.transitions import MOVED, Filed, Held, Transitions, joined
@@ -20,10 +22,10 @@ from t6gps.learner.rows import Floats
 from t6gps.learner.settings import ActionValueSettings, LearnerSettings, Localization
 from t6gps.storage import schema
 from t6gps.storage.errors import RunError
-from t6gps.storage.records import PolicySnapshot
+from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.storage.schema import FRAMES
 
-REACH_M, EPISODES_N, ROWS_N = 0.07, 100, 100
+REACH_M, EPISODES_N, ROWS_N, NOISE_STD_M = 0.07, 100, 100, 0.1
 AHEAD, LEFT = 0, 1
 """Winches of the planted world: what the first two do in a step is its velocity along the axes of the frame."""
 
@@ -225,7 +227,9 @@ def with_motion(table: pa.Table, seed: int) -> pa.Table:
 
 def test_what_is_read_of_an_episode_gives_back_its_columns(tables: list[pa.Table]) -> None:
     table, mirrored = with_motion(tables[0], 1), np.arange(24) % 2 == 1
-    known = transitions.recalled({0: table}, transitions.Motion(mirrored), REACH_M)
+    taken = Episodes([Canonical("nodes"), transitions.Motion(mirrored)], longest_segment_steps=20)
+    taken.add(0, table.select(transitions.COLUMNS))
+    known = transitions.of_columns(taken.joined().columns, REACH_M)
     rows, target = np.arange(table.num_rows), schema.array(table, "target_direction")
     assert np.allclose(known.direction(rows, known.heading), target, atol=1e-5)
     inputs, _ = every(known)
@@ -240,6 +244,11 @@ def test_what_is_read_of_an_episode_gives_back_its_columns(tables: list[pa.Table
     assert np.allclose(sign, np.where(mirrored[schema.array(table, "element")], -1, 1), atol=1e-5)
 
 
+def recorded(table: pa.Table, columns: Sequence[str]) -> Episode:
+    """An episode of which some columns are read."""
+    return Episode(table.select([*columns, "episode_id"]), pa.table({"noise_std_m": [NOISE_STD_M]}))
+
+
 def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_was_told(
     tables: list[pa.Table],
     make_learner: Callable[..., Learner],
@@ -247,13 +256,13 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
     monkeypatch: pytest.MonkeyPatch,
     tmp_path: Path,
 ) -> None:
-    few = ActionValueSettings(steps=30, first_steps=30, remembered_iterations=2, critics=2)
+    few = ActionValueSettings(steps=30, first_steps=30, remembered_iterations=3, improved_iterations=2, critics=2)
     led_by = {"value_from": 1, "action_value": few, "rounds": 2, "models_share": 0.5}
     moving = [with_motion(table, number) for number, table in enumerate(tables)]
     kept: dict[int, list[pa.Table]] = {}
     monkeypatch.setattr(
-        "t6gps.storage.tables.frames_of",
-        lambda run, iteration, columns: {n: table.select(columns) for n, table in enumerate(kept[iteration])},
+        "t6gps.storage.tables.episodes_of",
+        lambda run, iteration, columns: [recorded(table, columns) for table in kept[iteration]],
     )
     plain, led = make_learner(), make_learner(**led_by)
     for iteration in range(4):
@@ -289,6 +298,7 @@ def test_what_leads_with_the_value_matters(
         ({"rounds": 2}, "need an action value; set value_from"),
         ({"models_share": 0.5}, "need an action value; set value_from"),
         ({"models_share": 0.5, "value_from": 1, "reduced_state": "com"}, "models_share needs reduced_state = nodes"),
+        ({"action_value": {"improved_iterations": 4}}, "is more than remembered_iterations = 3; remember as many"),
     ],
 )
 def test_settings_that_exclude_each_other_are_refused(wrong: dict[str, Any], said: str) -> None:
@@ -300,7 +310,7 @@ SMALL = {"hidden_layers": (8,), "batch": 16, "steps": 3, "first_steps": 5}
 CHANGES = {
     "remembered_iterations": 1, "discount": 0.5, "hidden_layers": (9,), "batch": 17, "steps": 4, "first_steps": 6,
     "learning_rate": 2e-3, "weight_decay": 0.5, "target_rate": 0.5, "own_heading_share": 1.0, "step_weight": 0.1,
-    "ascents": 2, "ascent_rate": 0.25, "critics": 2,
+    "ascents": 2, "ascent_rate": 0.25, "critics": 2, "improved_iterations": 2,
 }  # fmt: skip
 
 
