@@ -117,6 +117,11 @@ class LearnerSettings(Settings):
                 f"action_value.improved_iterations = {of_value.improved_iterations} is more than "
                 f"remembered_iterations = {of_value.remembered_iterations}; remember as many"
             )
+        if self.value_from and of_value.improved_iterations > 1 and self.replay_iterations:
+            raise ValueError(
+                f"action_value.improved_iterations = {of_value.improved_iterations} makes new pairs of earlier rows, "
+                f"and replay_iterations = {self.replay_iterations} would add their old ones; set it to 0"
+            )
         return self
 
     @model_validator(mode="after")

@@ -257,7 +257,7 @@ def test_a_learner_goes_on_from_its_checkpoint_and_is_led_from_the_iteration_it_
     tmp_path: Path,
 ) -> None:
     few = ActionValueSettings(steps=30, first_steps=30, remembered_iterations=3, improved_iterations=2, critics=2)
-    led_by = {"value_from": 1, "action_value": few, "rounds": 2, "models_share": 0.5}
+    led_by = {"value_from": 1, "action_value": few, "rounds": 2, "models_share": 0.5, "replay_iterations": 0}
     moving = [with_motion(table, number) for number, table in enumerate(tables)]
     kept: dict[int, list[pa.Table]] = {}
     monkeypatch.setattr(
@@ -299,6 +299,7 @@ def test_what_leads_with_the_value_matters(
         ({"models_share": 0.5}, "need an action value; set value_from"),
         ({"models_share": 0.5, "value_from": 1, "reduced_state": "com"}, "models_share needs reduced_state = nodes"),
         ({"action_value": {"improved_iterations": 4}}, "is more than remembered_iterations = 3; remember as many"),
+        ({"action_value": {"improved_iterations": 2}, "value_from": 1}, "would add their old ones; set it to 0"),
     ],
 )
 def test_settings_that_exclude_each_other_are_refused(wrong: dict[str, Any], said: str) -> None:
