@@ -62,11 +62,11 @@ def figures(
             evaluation_id = _kept(there, run_name, version)
         if evaluation_id is None:
             evaluation_id = _made(there, run, version, far=server is not None)
-        material = _gathered(there, run, iterations, evaluation_id, episode)
+        material = gathered(there, run, iterations, evaluation_id, episode)
     with terminal.task("drawing") as progress:
         drawn = drawing.draw(material, out or Path("figures") / run_name, progress)
-    for reason in drawn.left_out:
-        terminal.say(reason)
+    for name, reason in drawn.left_out.items():
+        terminal.say(f"left out: {name}; {reason}")
     typer.echo("\n".join(map(str, drawn.files)))
 
 
@@ -105,7 +105,7 @@ def _made(there: Door, run: Run, version: int, far: bool) -> int:
     return number
 
 
-def _gathered(there: Door, run: Run, iterations: pa.Table, evaluation_id: int, episode: int | None) -> Material:
+def gathered(there: Door, run: Run, iterations: pa.Table, evaluation_id: int, episode: int | None) -> Material:
     """What the figures are drawn from. DataError for an evaluation or an episode that is not there."""
     from t6gps.service.views import run_figures
     from t6gps.service.views.paper.material import FRAME_COLUMNS, MODEL_COLUMNS, Material

@@ -6,6 +6,7 @@ from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 
+import numpy as np
 import pyarrow.compute as pc
 from matplotlib.figure import Figure
 
@@ -17,7 +18,7 @@ from t6gps.service.views.paper.models import models
 from t6gps.service.views.paper.segments import trajectory
 from t6gps.service.views.paper.snapshots import snapshots
 from t6gps.service.views.paper.speeds import speeds
-from t6gps.service.views.paper.stretch import Stretch, stretch
+from t6gps.service.views.paper.stretch import Stretch, stretch, track
 from t6gps.service.views.paper.topology import topology
 from t6gps.storage.errors import ConfigError
 from t6gps.workers.pictures.scene import Sizes
@@ -27,10 +28,10 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True)
 class Drawn:
-    """Files that were written, and why a figure was left out."""
+    """Files that were written, and figures that were left out, with the reason."""
 
     files: list[Path]
-    left_out: list[str]
+    left_out: dict[str, str]
 
 
 def draw(material: Material, folder: Path, progress: Progress) -> Drawn:
@@ -38,15 +39,11 @@ def draw(material: Material, folder: Path, progress: Progress) -> Drawn:
 
     ConfigError where the folder cannot be written.
     """
-    files, left_out = list[Path](), list[str]()
+    files = list[Path]()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         for done, (name, figure) in enumerate(FIGURES.items()):
-            if name == "models" and not material.models.num_rows:
-                left_out.append(
-                    f"left out: {name}, since run {material.run} keeps no local models; those that the backward pass "
-                    "leads keep them, from version 6 of the tables on"
-                )
+            if name in lacking(material):
                 continue
             drawn = figure(material)
             suffixes = (".png",) if name == "snapshots" else (".png", ".svg")
@@ -56,15 +53,26 @@ def draw(material: Material, folder: Path, progress: Progress) -> Drawn:
         raise ConfigError(
             f"cannot write {folder}: {error.strerror}; choose a folder that you may write with --out"
         ) from error
-    return Drawn(files, left_out)
+    return Drawn(files, lacking(material))
+
+
+def lacking(material: Material) -> dict[str, str]:
+    """Figures that have nothing to show, by their names, and why."""
+    if material.models.num_rows:
+        return {}
+    return {"models": f"run {material.run} keeps no local models, which runs before version 6 of the tables do not"}
 
 
 def _stretch(material: Material) -> Stretch:
     return stretch(material.shown.frames, level=material.terrain is None)
 
 
-def _stretch_title(material: Material, shown: Stretch) -> str:
-    return f"{material.title}: {shown.gain_m:+.2f} m in {(shown.last - shown.first) / 10:.0f} s"
+def _title(material: Material, shown: Stretch) -> str:
+    """Names the episode, and says what the robot does in the stretch that is shown."""
+    path = track(material.shown.frames)
+    way_m = np.hypot(*(path[shown.last] - path[shown.first]))
+    way = f"{way_m:.2f} m far" if material.terrain is None else f"{shown.gain_m:.2f} m up"
+    return f"{material.title}: {way} in {(shown.last - shown.first) / 10:.0f} s"
 
 
 def _ground_track(material: Material) -> Figure:
@@ -75,13 +83,12 @@ def _ground_track(material: Material) -> Figure:
 def _snapshots(material: Material) -> Figure:
     shown, config = _stretch(material), material.config
     sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
-    title = _stretch_title(material, shown)
-    return snapshots(material.shown.frames, material.terrain, shown, sizes, title)
+    return snapshots(material.shown.frames, material.terrain, shown, sizes, _title(material, shown))
 
 
 def _footprints(material: Material) -> Figure:
-    shown, title = _stretch(material), _stretch_title(material, _stretch(material))
-    return footprints(material.shown.frames, material.terrain, shown, material.config.robot.bar_radius_m, title)
+    shown, radius_m = _stretch(material), material.config.robot.bar_radius_m
+    return footprints(material.shown.frames, material.terrain, shown, radius_m, _title(material, shown))
 
 
 def _trajectory(material: Material) -> Figure:

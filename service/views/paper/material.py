@@ -13,7 +13,9 @@ from t6gps.workers.ground.terrain import Terrain
 
 FRAME_COLUMNS = ("episode_id", "step", "face", "kind", "entry_edge", "exit_edge", "forward_speed_m_per_s")
 """What figures of many episodes read of their frames."""
-MODEL_COLUMNS = ("bin", "kind", "entry_edge", "exit_edge", "truncated", "pooled", "step", "mode", "samples", "residual")
+MODEL_COLUMNS = (
+    "iteration", "bin", "kind", "entry_edge", "exit_edge", "truncated", "pooled", "step", "mode", "samples", "residual",
+)  # fmt: skip
 """What they read of the table `models`."""
 
 

@@ -17,6 +17,9 @@ from t6gps.service.views.run_figures import STYLE, Array, canvas
 from t6gps.workers.robot.symmetry import EDGE_NAMES
 from t6gps.workers.robot.topology import KIND_NAMES
 
+SHADES_N = 256
+"""Colours of a quantity that is no count."""
+
 
 class Bin(NamedTuple):
     """Models of one group of samples.
@@ -64,7 +67,7 @@ def _name(row: Mapping[str, object]) -> str:
 
 def models(material: Material) -> Figure:
     """Number of modes, and residual of their fits, of each class at each aligned time step."""
-    found = bins(material.models)
+    found, iteration = bins(material.models), material.models["iteration"][0].as_py()
     with rc_context(STYLE):
         figure = canvas(9.4, 1.5 + 0.24 * len(found))
         left, right = figure.subplots(1, 2, sharey=True)
@@ -76,9 +79,17 @@ def models(material: Material) -> Figure:
                 ink = "white" if value <= (most + 1) / 2 else "black"
                 left.annotate(f"{value:.0f}", (step, row), ha="center", va="center", fontsize=6.5, color=ink)
         residual = _grid([each.residual for each in found])
-        _map(figure, right, residual, "residual (standard deviations)", (0, max(float(np.nanmax(residual)), 1e-9)), 256)
+        _map(
+            figure,
+            right,
+            residual,
+            "residual (standard deviations)",
+            (0, max(float(np.nanmax(residual)), 1e-9)),
+            SHADES_N,
+        )
         left.set_yticks(range(len(found)), [f"{each.name}  ({each.samples:,})" for each in found], fontsize=8.5)
-        left.set_title("Modes (in brackets: samples; ·: no edge)", fontsize=9.5)
+        left.set_ylabel("class (samples); ·: no edge", fontsize=9)
+        left.set_title(f"Modes, iteration {iteration}", fontsize=9.5)
         right.set_title("Residual of the fits", fontsize=9.5)
     return figure
 
@@ -95,8 +106,8 @@ def _map(figure: Figure, axes: Axes, grid: Array, label: str, limits: tuple[floa
     colours = colormaps["cividis"].resampled(colours_n)
     image = axes.imshow(grid, cmap=colours, vmin=limits[0], vmax=limits[1], aspect="auto", interpolation="none")
     bar = figure.colorbar(image, ax=axes, label=label, location="bottom", shrink=0.7, aspect=30)
-    bar.locator = MaxNLocator(6, integer=colours_n < 256)
-    bar.update_ticks()
+    if colours_n < SHADES_N:
+        bar.set_ticks(range(1, colours_n + 1))
     axes.grid(visible=False)
     axes.xaxis.set_major_locator(MaxNLocator(integer=True))
     axes.set_xlabel("aligned time step of the class")

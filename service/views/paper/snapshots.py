@@ -29,8 +29,8 @@ def snapshots(frames: pa.Table, terrain: Terrain | None, shown: Stretch, sizes: 
         above.set_axis_off()
         above.set_title(title)
         below.plot(time_s, height_m, color=BLUE, label="centre of mass")
-        if terrain is not None:
-            below.plot(time_s, terrain.height(*track(frames)[rows].T), color=GREY, linestyle="--", label="ground below")
+        ground_m = np.zeros_like(height_m) if terrain is None else terrain.height(*track(frames)[rows].T)
+        below.plot(time_s, ground_m, color=GREY, linestyle="--", label="ground below")
         for step in steps:
             below.axvline(numbers(frames, "time_s")[step], color=DARK, linewidth=0.8, linestyle=":")
         below.set(xlabel="time (s)", ylabel="height (m)")

@@ -24,16 +24,15 @@ def speeds(material: Material) -> Figure:
     )
     everything = np.concatenate([values for _, values, _ in parts])
     with rc_context(STYLE):
-        figure = canvas(4.8, 3.4)
+        figure = canvas(4.8, 3.9)
         axes = figure.subplots()
         for name, values, look in parts:
-            label = f"{name}: mean {values.mean():.2f} m/s,\n{share_stuck(values):.0%} within ±{STUCK_M_PER_S} m/s"
+            label = f"{name}: mean {values.mean():.2f} m/s, {share_stuck(values):.0%} within ±{STUCK_M_PER_S} m/s"
             axes.hist(values, edges(everything).tolist(), density=True, histtype="step", label=label, **look)
         axes.axvline(0, color=DARK, linewidth=0.8)
         low, high = np.percentile(everything, SHOWN_PERCENT)
         axes.set(xlim=(low, high), xlabel="speed to the waypoint (m/s)", ylabel="density (s/m)")
-        axes.margins(y=0.1)
-        axes.legend(loc="upper right", fontsize=9)
+        figure.legend(loc="outside lower center", fontsize=9)
     return figure
 
 

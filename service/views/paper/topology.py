@@ -72,7 +72,7 @@ def topology(material: Material) -> Figure:
 
 def _triangles(axes: Axes, counts: Counts, face: Counts) -> None:
     place, share = places(), np.bincount(face, minlength=FACES_N) / len(face)
-    largest = max(int(counts.max()), 1)
+    largest = int(counts.max())
     for a, b in zip(np.repeat(np.arange(FACES_N), 3), NEIGHBOR_FACE.ravel(), strict=True):
         if a < b:
             axes.plot(*place[[a, b]].T, color=LIGHT, linewidth=0.8, zorder=1)
@@ -91,7 +91,7 @@ def _triangles(axes: Axes, counts: Counts, face: Counts) -> None:
         axes.annotate(str(number), tuple(middle), ha="center", va="center", fontsize=6.5, color=DARK, zorder=4)
     neighbours = np.take_along_axis(counts, NEIGHBOR_FACE, axis=1).sum()
     jumps = int(counts.sum() - neighbours)
-    axes.set_title(f"{neighbours:,} changes of the triangle, most common {largest:,}; {jumps:,} jumps", fontsize=9.5)
+    axes.set_title(f"{neighbours:,} rolls over an edge, up to {largest:,} over one; {jumps:,} jumps", fontsize=9.5)
     axes.set_axis_off()
     axes.set_aspect("equal")
     axes.margins(0.08)
@@ -121,4 +121,4 @@ def _matrix(axes: Axes, counts: Counts) -> None:
     axes.axhline(FIRST_LAMBDA - 0.5, color=GREY, linewidth=0.8)
     axes.axvline(FIRST_LAMBDA - 0.5, color=GREY, linewidth=0.8)
     axes.set_xlabel("the class that follows", fontsize=9)
-    axes.set_title("followed by ... in percent (in brackets: segments)", fontsize=9.5)
+    axes.set_title("What follows (%); in brackets: segments", fontsize=9.5)

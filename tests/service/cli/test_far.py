@@ -86,6 +86,7 @@ REFUSALS = {
         ["tiny", "--pick", "best:3", "--evaluation", "0", "--out", "x.rrd"],
         ["tiny", "0", "--evaluation", "7", "--out", "x.rrd"],
     ],
+    "figures": [["paused"], ["tiny", "--evaluation", "7"]],
     "fetch": [["none"], ["tiny", "--run", "../up"]],
     "scale": [["paused", "2"], ["none", "2"], ["tiny", "2"]],
     "pause": [["paused"], ["none"]],
@@ -181,6 +182,11 @@ def test_pictures_and_runs_come_home_with_the_same_bytes(
     assert (tmp_path / "here.png").read_bytes() == (tmp_path / "far.png").read_bytes()
     here, far = ({path.name for path in (tmp_path / f"{name}-rrd").iterdir()} for name in ("here", "far"))
     assert here == far == {"tiny-evaluation-0-0.rrd", "tiny-evaluation-0-1.rrd"}
+
+
+def test_figures_of_a_server_need_episodes_that_it_keeps(place: tuple[Path, str]) -> None:
+    refused = t6gps("figures", "tiny", "--server", place[1], code=2).stderr
+    assert "t6gps eval tiny" in refused and "--evaluation 0" in refused
 
 
 @pytest.mark.parametrize("evaluation", [None, 0])
