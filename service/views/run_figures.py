@@ -141,7 +141,8 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings
     corners = np.concatenate([path, path[:1] - 1.5, path[:1] + 1.5, goals - 1.5, goals + 1.5])
     low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
     with rc_context(STYLE):
-        figure = canvas(5.6, 5.2)
+        width, height = high - low
+        figure = canvas(5.6, float(np.clip(1.3 + 4.1 * height / width, 3.2, 7.0)))
         axes = figure.subplots()
         terrain = ground(settings.terrain, shown["terrain_seed"], shown["terrain_difficulty"])
         if terrain is not None:
@@ -153,7 +154,8 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings
             radius_m = settings.task.waypoint_radius_m
             disc = Circle(tuple(goal), radius_m, facecolor=(1, 1, 1, 0.6), edgecolor=DARK, zorder=3)
             axes.add_patch(disc)
-            axes.annotate(str(number + 1), goal, ha="center", va="center", fontweight="bold", zorder=4)
+            label = axes.annotate(str(number + 1), goal, ha="center", va="center", fontweight="bold", zorder=7)
+            label.set_path_effects([Stroke(linewidth=2.5, foreground="white"), Normal()])
         halo = [Stroke(linewidth=4.5, foreground="white"), Normal()]
         axes.plot(*path.T, color=RED, linewidth=2.2, zorder=5, path_effects=halo, label="centre of mass")
         axes.plot(*path[-1], color=RED, marker="o", markeredgecolor="white", markersize=7, zorder=6)

@@ -20,7 +20,7 @@ from t6gps.workers.robot.topology import DELTA, FACE_KINDS, FACES
 
 Flags = NDArray[np.bool_]
 
-MARGIN_M = 0.9
+MARGIN_M = 0.3
 TOUCH_M = 0.01
 """A node whose surface is this close to the ground counts as on it."""
 DELTA_FILL = (0, 0.45, 0.7, 0.16)
@@ -32,20 +32,21 @@ def footprints(frames: pa.Table, terrain: Terrain | None, shown: Stretch, node_r
     Nodes on the ground are filled dots, others rings. Dark lines are the ways of nodes while they touch the ground.
     """
     path, nodes = track(frames), world_nodes(frames)
-    chosen = path[shown.first : shown.last + 1]
-    low, high = chosen.min(axis=0) - MARGIN_M, chosen.max(axis=0) + MARGIN_M
+    chosen, found = path[shown.first : shown.last + 1], stays(frames, shown)
+    corners = [nodes[(first + last) // 2, FACES[face], :2] for first, last, face in found]
+    whole = np.concatenate([chosen, *corners])
+    low, high = whole.min(axis=0) - MARGIN_M, whole.max(axis=0) + MARGIN_M
     with rc_context(STYLE):
         width, height = high - low
         figure = canvas(6.4, float(np.clip(1.6 + 4.6 * height / width, 3.0, 8.0)))
         axes = figure.subplots()
         if terrain is not None:
             contours(figure, axes, terrain, low, high, unused=1.5)
-        for first, last, face in stays(frames, shown):
+        for (first, last, face), triangle in zip(found, corners, strict=True):
             feet = nodes[first : last + 1, FACES[face]]
             touching = clearance(terrain, feet) < node_radius_m + TOUCH_M
-            middle = (last - first) // 2
-            _triangle(axes, feet[middle, :, :2], face)
-            _feet(axes, feet[middle, :, :2], touching[middle])
+            _triangle(axes, triangle, face)
+            _feet(axes, triangle, touching[(last - first) // 2])
             _slip(axes, np.where(touching[..., None], feet[..., :2], np.nan))
         axes.plot(*path.T, color=GREY, linewidth=1.0)
         axes.plot(*chosen.T, color=RED, linewidth=2.0, zorder=4)
