@@ -48,6 +48,13 @@ def test_a_segment_knows_its_row(found: list[Segment], frames: pa.Table) -> None
     assert [(episodes[each.row], steps[each.row]) for each in found] == [(each.episode, each.start) for each in found]
 
 
+def test_two_episodes_on_the_same_triangle_are_two_segments() -> None:
+    steps = [0, 1, 2, 0, 1, 2]
+    same = {"face": [4] * 6, "kind": [0] * 6, "entry_edge": [None] * 6, "exit_edge": [None] * 6}
+    found = cutting.segments(pa.table({"episode_id": [1, 1, 1, 2, 2, 2], "step": steps, **same}), 20)
+    assert [(each.episode, each.row, each.start, each.stop) for each in found] == [(1, 0, 0, 2), (2, 3, 0, 2)]
+
+
 def test_crossings_are_the_transitions_of_sql(tiny: Trained, frames: pa.Table) -> None:
     sql = "SELECT from_face, face, count(*) AS n FROM transitions GROUP BY ALL"
     asked = np.zeros((FACES_N, FACES_N), int)
