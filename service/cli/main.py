@@ -21,7 +21,7 @@ from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
 from t6gps.service.cli import doctor, door, launching, live, serving
-from t6gps.service.cli.data import asking, care, export, listing, pictures
+from t6gps.service.cli.data import asking, care, export, figures, listing, pictures
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -226,7 +226,7 @@ def bench(
     typer.echo("".join(f"{note}\n" for note in measurement.notes), nl=False)
 
 
-for commands in (listing, asking, pictures, export, care):
+for commands in (listing, asking, pictures, figures, export, care):
     commands.add_to(app)
 live.add_to(app)
 launching.add_to(app)

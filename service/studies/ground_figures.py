@@ -14,11 +14,13 @@ import pyarrow.compute as pc
 from matplotlib import rc_context
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
-from matplotlib.patches import Polygon
 from numpy.typing import NDArray
 
 from t6gps.service.studies.conduct import Finished
 from t6gps.service.views import run_figures
+from t6gps.service.views.paper.footprints import footprints as drawn_footprints
+from t6gps.service.views.paper.snapshots import snapshots
+from t6gps.service.views.paper.stretch import Stretch, smooth
 from t6gps.service.views.run_figures import (
     BLUE,
     DARK,
@@ -27,18 +29,15 @@ from t6gps.service.views.run_figures import (
     RED,
     STYLE,
     canvas,
-    contours,
     numbers,
 )
 from t6gps.storage import tables
 from t6gps.storage.sql.query import Question, query
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.ground.terrain import Terrain
-from t6gps.workers.pictures import render
 from t6gps.workers.pictures.scene import Sizes
-from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.symmetry import EDGE_NAMES
-from t6gps.workers.robot.topology import BAR_LENGTH_M, DELTA, FACES, KIND_NAMES, LAMBDA
+from t6gps.workers.robot.topology import BAR_LENGTH_M, DELTA, KIND_NAMES, LAMBDA
 
 Array = NDArray[np.float64]
 
@@ -68,26 +67,22 @@ HIGH_CLIMB_M = 2 / 3 * BAR_LENGTH_M
 """Net height gain that the paper shows (Sec. V-C): two thirds of a bar."""
 MOVING_M_PER_S = 0.2
 BINS_N = 12
-SNAPSHOTS_N = 6
 GRADE_DEG, GRADES_DEG = 5.0, 35.0
 """Width of a bin of slopes, and the steepest of them."""
 FEWEST_STEPS_N = 100
 """A bin with fewer rows has no mean worth drawing."""
 SLOPE_POINTS_N = 7
-FOOTPRINT_MARGIN_M = 1.2
 
 
 @dataclass(frozen=True)
 class Climb:
-    """The largest climb of a study: its run, its episode's frames by step and ground, and its first and last step."""
+    """The largest climb of a study: its run, its episode's frames by step and ground, and where it lies in them."""
 
     outcome: Finished
     frames: pa.Table
     terrain: Terrain | None
     episode_id: int
-    gain_m: float
-    bottom: int
-    top: int
+    shown: Stretch
 
 
 def ground_track(finished: Sequence[Finished]) -> Figure:
@@ -109,80 +104,26 @@ def largest_climb(finished: Sequence[Finished]) -> Climb:
     row = tables.read(outcome.run, "episodes", filter=pc.field("episode_id") == best["episode_id"]).to_pylist()[0]
     terrain = ground(outcome.trial.config.terrain, row["terrain_seed"], row["terrain_difficulty"])
     top = best["top_step"]
-    bottom = int(_smooth(numbers(frames, "com_z_m"))[: top + 1].argmin())
-    return Climb(outcome, frames, terrain, best["episode_id"], best["gain_m"], bottom, top)
-
-
-def _smooth(heights: Array) -> Array:
-    """Running means over up to five entries each way, as in LARGEST_CLIMBS."""
-    sums = np.concatenate([[0.0], np.cumsum(heights)])
-    here = np.arange(len(heights))
-    first, last = np.maximum(here - 5, 0), np.minimum(here + 6, len(heights))
-    smooth: Array = (sums[last] - sums[first]) / (last - first)
-    return smooth
+    bottom = int(smooth(numbers(frames, "com_z_m"))[: top + 1].argmin())
+    return Climb(outcome, frames, terrain, best["episode_id"], Stretch(bottom, top, best["gain_m"]))
 
 
 def footprints(finished: Sequence[Finished]) -> Figure:
-    """The largest climb from above: the triangle under the centre of mass at every change (paper Sec. V-C)."""
+    """The largest climb from above: the triangles under the centre of mass and their nodes (paper Sec. V-C)."""
     climb_ = largest_climb(finished)
-    frames = climb_.frames
-    path = np.column_stack([numbers(frames, "com_x_m"), numbers(frames, "com_y_m")])
-    face, nodes = numbers(frames, "face").astype(int), _world_nodes(frames)
-    shown = path[climb_.bottom : climb_.top + 1]
-    low, high = shown.min(axis=0) - FOOTPRINT_MARGIN_M, shown.max(axis=0) + FOOTPRINT_MARGIN_M
-    with rc_context(STYLE):
-        width, height = high - low
-        figure = canvas(7.5, float(np.clip(1.0 + 5.6 * height / width, 3.0, 9.0)))
-        axes = figure.subplots()
-        if climb_.terrain is not None:
-            contours(figure, axes, climb_.terrain, low, high)
-        changes = np.flatnonzero(np.diff(face, prepend=-1) != 0)
-        for step in changes[(changes >= climb_.bottom) & (changes <= climb_.top)]:
-            corners = nodes[step, FACES[face[step]], :2]
-            axes.add_patch(Polygon(corners, facecolor=(0, 0.45, 0.7, 0.08), edgecolor=BLUE, linewidth=1.0))
-        axes.plot(*path.T, color=GREY, linewidth=1.0)
-        axes.plot(*shown.T, color=RED, linewidth=2.2)
-        axes.plot(*shown[0], color=RED, marker="o", markersize=8, markeredgecolor="white", zorder=5)
-        axes.annotate("start", shown[0], xytext=(8, 8), textcoords="offset points", fontweight="bold", zorder=6)
-        seconds = (climb_.top - climb_.bottom) / 10
-        title = f"{climb_.outcome.run.name}, episode {climb_.episode_id}: {climb_.gain_m:.2f} m up in {seconds:.1f} s"
-        axes.set(title=title, xlabel="x (m)", ylabel="y (m)", aspect="equal")
-        axes.set(xlim=(low[0], high[0]), ylim=(low[1], high[1]))
-    return figure
-
-
-def _world_nodes(frames: pa.Table) -> Array:
-    """Nodes [T + 1, 12, 3] (m) from the recorded bars."""
-    positions = numbers(frames, "bar_positions").reshape(-1, 6, 3)
-    orientations = numbers(frames, "bar_orientations").reshape(-1, 6, 4)
-    still, lengths = np.zeros_like(positions), np.zeros((len(positions), 24))
-    return RobotState.of(positions, orientations, still, still, lengths).nodes()
+    seconds = (climb_.shown.last - climb_.shown.first) / 10
+    title = f"{climb_.outcome.run.name}, episode {climb_.episode_id}: {climb_.shown.gain_m:.2f} m up in {seconds:.1f} s"
+    radius_m = climb_.outcome.trial.config.robot.bar_radius_m
+    return drawn_footprints(climb_.frames, climb_.terrain, climb_.shown, radius_m, title)
 
 
 def climb(finished: Sequence[Finished]) -> Figure:
     """Snapshots of the largest climb by the project's own renderer, and the height along it (paper Sec. V-C)."""
     climb_ = largest_climb(finished)
-    steps = np.linspace(climb_.bottom, climb_.top, SNAPSHOTS_N).round().astype(int).tolist()
     config = climb_.outcome.trial.config
     sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
-    picture = render.snapshots(climb_.frames, climb_.terrain, steps, sizes)
-    with rc_context(STYLE):
-        figure = canvas(11, 7.6)
-        above, below = figure.subplots(2, 1, height_ratios=[2.6, 1])
-        above.imshow(picture)
-        above.set_axis_off()
-        above.set_title(f"{climb_.outcome.run.name}, episode {climb_.episode_id}, {climb_.gain_m:.2f} m up")
-        heights = numbers(climb_.frames, "com_z_m")
-        time_s = numbers(climb_.frames, "time_s")
-        below.plot(time_s, heights, color=RED, label="centre of mass")
-        if climb_.terrain is not None:
-            place = numbers(climb_.frames, "com_x_m"), numbers(climb_.frames, "com_y_m")
-            below.plot(time_s, climb_.terrain.height(*place), color=GREY, label="ground below it")
-        for step in steps:
-            below.axvline(time_s[step], color=DARK, linewidth=0.7)
-        below.set(xlabel="time (s)", ylabel="height (m)")
-        below.legend(ncols=2, loc="upper left", bbox_to_anchor=(0, 1.2))
-    return figure
+    title = f"{climb_.outcome.run.name}, episode {climb_.episode_id}, {climb_.shown.gain_m:.2f} m up"
+    return snapshots(climb_.frames, climb_.terrain, climb_.shown, sizes, title)
 
 
 def climbs(finished: Sequence[Finished]) -> Figure:

@@ -88,9 +88,12 @@ def draw(run: Run, settings: RolloutSettings) -> list[Path]:
 
 
 def save(figure: Figure, path: Path) -> Path:
+    """Write a figure as its file's name says, PNG or SVG, whole or not at all; its folder is made when missing."""
     path.parent.mkdir(exist_ok=True)
-    with rc_context(STYLE):
-        figure.savefig(durable.hidden(path), format="png")
+    with rc_context({**STYLE, "svg.hashsalt": path.stem}):
+        figure.savefig(
+            durable.hidden(path), format=path.suffix[1:], metadata={"Date": None} if path.suffix == ".svg" else None
+        )
     durable.publish(path)
     return path
 
@@ -131,17 +134,17 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings
 
     Darker ground is lower, the grey circle has the size of the robot (paper Sec. V, the figure of the ground track).
     """
-    order = np.argsort(numbers(episodes, SPEED), kind="stable")
     rows = episodes.to_pylist()
-    typical = rows[int(order[(len(order) - 1) // 2])]
-    alike = [row["episode_id"] for row in rows if _ground(row) == _ground(typical) and row is not typical]
-    path, goals = _track(frames, typical["episode_id"])
+    shown = rows[typical(episodes)]
+    alike = [row["episode_id"] for row in rows if _ground(row) == _ground(shown) and row is not shown]
+    path, goals = _track(frames, shown["episode_id"])
     corners = np.concatenate([path, path[:1] - 1.5, path[:1] + 1.5, goals - 1.5, goals + 1.5])
     low, high = corners.min(axis=0) - 0.5, corners.max(axis=0) + 0.5
     with rc_context(STYLE):
-        figure = canvas(7, 6.2)
+        width, height = high - low
+        figure = canvas(5.6, float(np.clip(1.3 + 4.1 * height / width, 3.2, 7.0)))
         axes = figure.subplots()
-        terrain = ground(settings.terrain, typical["terrain_seed"], typical["terrain_difficulty"])
+        terrain = ground(settings.terrain, shown["terrain_seed"], shown["terrain_difficulty"])
         if terrain is not None:
             contours(figure, axes, terrain, low, high)
         for other in alike[:OTHER_TRACKS_N]:
@@ -151,11 +154,12 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings
             radius_m = settings.task.waypoint_radius_m
             disc = Circle(tuple(goal), radius_m, facecolor=(1, 1, 1, 0.6), edgecolor=DARK, zorder=3)
             axes.add_patch(disc)
-            axes.annotate(str(number + 1), goal, ha="center", va="center", fontweight="bold", zorder=4)
+            label = axes.annotate(str(number + 1), goal, ha="center", va="center", fontweight="bold", zorder=7)
+            label.set_path_effects([Stroke(linewidth=2.5, foreground="white"), Normal()])
         halo = [Stroke(linewidth=4.5, foreground="white"), Normal()]
-        axes.plot(*path.T, color=RED, linewidth=2.2, zorder=5, path_effects=halo, label="typical episode")
+        axes.plot(*path.T, color=RED, linewidth=2.2, zorder=5, path_effects=halo, label="centre of mass")
         axes.plot(*path[-1], color=RED, marker="o", markeredgecolor="white", markersize=7, zorder=6)
-        axes.set_title(f"Centre of mass, episode {typical['episode_id']}: {typical[SPEED]:+.2f} m/s forward")
+        axes.set_title(f"Episode {shown['episode_id']}: {shown[SPEED]:+.2f} m/s forward")
         axes.set(xlabel="x (m)", ylabel="y (m)", aspect="equal", xlim=(low[0], high[0]), ylim=(low[1], high[1]))
         dot = partial(Line2D, [], [], marker="o", markersize=10, linestyle="", markeredgecolor=DARK)
         labels = {str(line.get_label()): line for line in axes.get_lines()}
@@ -164,6 +168,12 @@ def ground_track(frames: pa.Table, episodes: pa.Table, settings: RolloutSettings
         handles["waypoint"] = dot(color="white")
         figure.legend(list(handles.values()), list(handles), loc="outside lower center", ncols=4)
     return figure
+
+
+def typical(episodes: pa.Table) -> int:
+    """Which row of `episodes` has the median forward speed; of an even number the slower of two."""
+    order = np.argsort(numbers(episodes, SPEED), kind="stable")
+    return int(order[(len(order) - 1) // 2])
 
 
 def _ground(episode: Mapping[str, float]) -> tuple[int, float] | None:
@@ -181,14 +191,17 @@ def _track(frames: pa.Table, episode_id: int) -> tuple[Array, Array]:
     return path, goals[np.sort(first)]
 
 
-def contours(figure: Figure, axes: Axes, terrain: Terrain, low: Array, high: Array) -> None:
+def contours(figure: Figure, axes: Axes, terrain: Terrain, low: Array, high: Array, unused: float = 0.5) -> None:
+    """Heights of the ground in a rectangle (m), darker where it is lower.
+
+    unused   dark colours that are left out, as a share of the span of heights, so that what lies on them is seen
+    """
     x, y = np.meshgrid(np.linspace(low[0], high[0], 200), np.linspace(low[1], high[1], 200))
     heights = terrain.height(x, y)
     if np.ptp(heights) == 0:  # level where the robot went, though perhaps not elsewhere
         return
     levels = np.linspace(heights.min(), heights.max(), 9)
-    # Half of the colours, the light ones: tracks and labels must stay readable on the lowest ground.
-    darkest = levels[0] - (levels[-1] - levels[0]) / 2
+    darkest = levels[0] - (levels[-1] - levels[0]) * unused
     filled = axes.contourf(x, y, heights, levels=levels, cmap="bone", vmin=darkest, zorder=0)
     figure.colorbar(filled, ax=axes, label="height of the ground (m)", shrink=0.85, format="%.1f")
     axes.grid(visible=False)
@@ -261,7 +274,7 @@ def _class_sizes(axes: Axes, classes: pa.Table) -> None:
     colours = [CLASS_COLOURS.get(key, LIGHT) for key in keys]
     bars = axes.barh(np.arange(len(keys)), [sizes[key] for key in keys], color=colours)
     axes.bar_label(bars, padding=3, fontsize=8, color=DARK)
-    axes.set_yticks(np.arange(len(keys)), [_class_label(key) for key in keys], fontsize=9)
+    axes.set_yticks(np.arange(len(keys)), [class_label(key) for key in keys], fontsize=9)
     axes.invert_yaxis()
     axes.xaxis.set_major_locator(MaxNLocator(5, integer=True))
     axes.margins(x=0.12)
@@ -269,7 +282,8 @@ def _class_sizes(axes: Axes, classes: pa.Table) -> None:
     axes.set(title="Segments per class", xlabel="segments in the last iteration")
 
 
-def _class_label(key: ClassName) -> str:
+def class_label(key: ClassName) -> str:
+    """A class in words: kind of the triangle, and the edges through which it is entered and left."""
     kind, entry, exit_ = key
     if entry is None or exit_ is None:
         return f"{KIND_NAMES[kind]}  partial or cut"

@@ -18,6 +18,7 @@ from loopback import listening
 from tiny_run import Trained
 
 from t6gps.service.cli import door
+from t6gps.service.cli.data import figures
 from t6gps.service.cli.main import app
 from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
@@ -86,6 +87,7 @@ REFUSALS = {
         ["tiny", "--pick", "best:3", "--evaluation", "0", "--out", "x.rrd"],
         ["tiny", "0", "--evaluation", "7", "--out", "x.rrd"],
     ],
+    "figures": [["paused"], ["tiny", "--evaluation", "7"]],
     "fetch": [["none"], ["tiny", "--run", "../up"]],
     "scale": [["paused", "2"], ["none", "2"], ["tiny", "2"]],
     "pause": [["paused"], ["none"]],
@@ -181,6 +183,25 @@ def test_pictures_and_runs_come_home_with_the_same_bytes(
     assert (tmp_path / "here.png").read_bytes() == (tmp_path / "far.png").read_bytes()
     here, far = ({path.name for path in (tmp_path / f"{name}-rrd").iterdir()} for name in ("here", "far"))
     assert here == far == {"tiny-evaluation-0-0.rrd", "tiny-evaluation-0-1.rrd"}
+
+
+def test_figures_of_a_server_need_episodes_that_it_keeps(place: tuple[Path, str]) -> None:
+    refused = t6gps("figures", "tiny", "--server", place[1], code=2).stderr
+    assert "t6gps eval tiny" in refused and "--evaluation 0" in refused
+
+
+def test_what_figures_are_drawn_from_is_the_same_through_a_server(place: tuple[Path, str]) -> None:
+    root, url = place
+    stored = []
+    for server in (None, url):
+        with door.opened(root, server) as there, there.at_hand("tiny") as run:
+            stored.append(figures.gathered(there, run, there.table("tiny", "iterations"), 0, None))
+    here, far = stored
+    for name in ("iterations", "sampled", "models", "evaluation", "episodes", "frames"):
+        assert getattr(far, name).to_pylist() == getattr(here, name).to_pylist(), name
+        assert getattr(far, name).num_rows
+    assert far.shown.frames.equals(here.shown.frames)
+    assert (far.title, far.terrain) == (here.title, here.terrain)
 
 
 @pytest.mark.parametrize("evaluation", [None, 0])

@@ -67,6 +67,7 @@ def test_a_damaged_run_is_listed_with_the_reason_and_the_others_as_ever(damage: 
         ("query", "tiny", "SELECT count(*) FROM frames"),
         ("render", "tiny", "1", "--out", "still.png"),
         ("view", "tiny", "1", "--out", "episode.rrd"),
+        ("figures", "tiny", "--evaluation", "0"),
         ("eval", "tiny", "--episodes", "2", "--serial"),
     ],
     ids=lambda command: command[0],
@@ -79,6 +80,7 @@ def test_a_damaged_run_is_one_clear_error_of_whoever_needs_what_is_damaged(
         "query": {"unreadable configuration", "missing configuration", "missing ground", "missing table"},
         "render": {"missing table"},
         "view": {"missing table"},
+        "figures": set[str](),
         "eval": {"gap in a log", "missing table"},
     }
     needed = DAMAGES.keys() - spared[command[0]]
