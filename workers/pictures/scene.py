@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from t6gps.storage import schema
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures.landscape import Landscape
-from t6gps.workers.pictures.motion import numbers
 from t6gps.workers.pictures.raycast import Camera
+from t6gps.workers.robot.recorded import numbers
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.topology import BARS, BARS_N, CABLES, CABLES_N
 from t6gps.workers.settings import HALF_DIAMETER_M, RobotSettings

@@ -52,8 +52,17 @@ def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
         "stuck_share_by_speed",
         "waypoints_per_episode",
         "cost",
+        "speed_over_winch_speed",
+        "bar_lengths_per_s",
+        "cost_of_transport",
+        "slip_per_metre",
+        "sunk_cable_share",
     ):
         assert set(result[key]) == {"mean", "standard_error"}
+    speed = result["forward_speed_m_per_s"]["mean"]
+    assert result["bar_lengths_per_s"]["mean"] == pytest.approx(speed / 1.94)
+    assert result["speed_over_winch_speed"]["mean"] == pytest.approx(speed / 0.35)
+    assert result["cost_of_transport"]["mean"] > 0
 
 
 def test_eval_changes_the_world_but_not_the_policy(root: Path) -> None:

@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from t6gps.storage import schema
 from t6gps.workers.pictures import scene
-from t6gps.workers.pictures.motion import Motion, numbers
+from t6gps.workers.pictures.motion import Motion
 from t6gps.workers.pictures.viewer import colours
 from t6gps.workers.pictures.viewer.ground_mesh import around
 from t6gps.workers.pictures.viewer.rows import Rows
 from t6gps.workers.pictures.viewer.world import World
+from t6gps.workers.robot.recorded import numbers
 from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS_N, CABLES, CABLES_N, FACES, NODES_N
 
 Array = NDArray[np.float64]
