@@ -164,7 +164,7 @@ def climb(finished: Sequence[Finished]) -> Figure:
     climb_ = largest_climb(finished)
     steps = np.linspace(climb_.bottom, climb_.top, SNAPSHOTS_N).round().astype(int).tolist()
     config = climb_.outcome.trial.config
-    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
     picture = render.snapshots(climb_.frames, climb_.terrain, steps, sizes)
     with rc_context(STYLE):
         figure = canvas(11, 7.6)

@@ -21,6 +21,7 @@ class Motion:
 
     com            centre of mass [T + 1, 3] (m)
     nodes          ends of the bars [T + 1, 12, 3] (m)
+    attached       where cables attach near those ends [T + 1, 12, 3] (m)
     rest_lengths   of the cables [T + 1, 24] (m)
     commands       commanded rest lengths, for rows with an action [T, 24] (m)
     tensions       of the cables, by the law of the simulation [T + 1, 24] (N)
@@ -28,6 +29,7 @@ class Motion:
 
     com: Array
     nodes: Array
+    attached: Array
     rest_lengths: Array
     commands: Array
     tensions: Array
@@ -39,6 +41,7 @@ def motion(frames: pa.Table, robot: RobotSettings) -> Motion:
     return Motion(
         com=state.com,
         nodes=state.nodes(),
+        attached=state.nodes(robot.attachment_span_m),
         rest_lengths=state.rest_lengths,
         commands=in_order(frames, "action"),
         tensions=tensions(state, robot)[0],

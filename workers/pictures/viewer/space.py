@@ -47,7 +47,7 @@ def log_robot(rows: Rows, moved: Motion, world: World) -> None:
     rows.send("world/robot/nodes", nodes.partition([NODES_N] * n))
     rows.log("world/robot/cables", rr.LineStrips3D.from_fields(radii=[scene.CABLE_RADIUS_M]))
     lines = rr.LineStrips3D.columns(
-        strips=moved.nodes[:, CABLES].reshape(-1, 2, 3).astype(np.float32),
+        strips=moved.attached[:, CABLES].reshape(-1, 2, 3).astype(np.float32),
         colors=colours.of_tensions(moved.tensions.ravel(), world.brightest_n),
     )
     rows.send("world/robot/cables", lines.partition([CABLES_N] * n))
