@@ -7,6 +7,7 @@ import pytest
 
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.cables import loads, move_winches, tensions
+from t6gps.workers.physics.mujoco_engine import MujocoEngine
 from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
 from t6gps.workers.robot.topology import CABLES_N
 from t6gps.workers.settings import RobotSettings
@@ -30,6 +31,16 @@ def test_the_plugin_equals_the_reference_to_the_last_bit(change: dict[str, objec
             ends.append([engine.control_step(command) for command in COMMANDS][-1])
     assert np.array_equal(ends[0].bars, ends[1].bars)
     assert np.array_equal(ends[0].rest_lengths, ends[1].rest_lengths)
+
+
+def test_both_engines_have_the_same_winches_and_attachments() -> None:
+    robot, ends = HARDWARE.model_copy(update={"dead_winch": 5}), []
+    for engine_of in (PyBulletEngine, MujocoEngine):
+        with engine_of(robot) as engine:
+            engine.reset(neutral_state(robot, 50.0))
+            ends.append([engine.control_step(command) for command in COMMANDS][-1])
+    np.testing.assert_allclose(ends[1].nodes(), ends[0].nodes(), atol=1e-10)
+    np.testing.assert_allclose(ends[1].rest_lengths, ends[0].rest_lengths, atol=1e-12)
 
 
 @pytest.mark.parametrize("share", [0.0, 0.25, 0.9, 1.0, 1.5])
