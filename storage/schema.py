@@ -14,12 +14,12 @@ from numpy.typing import NDArray
 
 from t6gps.storage.fields import numbers, scalar, vector, vector_length
 
-SCHEMA_VERSION = 6
+SCHEMA_VERSION = 7
 """Grows with every change. Versions 2, 3, 5 and 6 added columns at the end of `iterations`, version 2 of `classes`,
 version 6 of `frames`; they are nullable, since older runs have none. Version 4 added the nodes to `observation`.
 Version 5 has null where older versions had 0 for what there is none of: standard errors of one episode, waypoints of a
 far direction, modes and residual of a class without a sample. Version 6 added `models`, `policies`, the tables of
-evaluations, and `realised_cost_change` to `iterations`."""
+evaluations, and `realised_cost_change` to `iterations`; version 7 the last five quantities to `evaluations`."""
 SENSORS_N, SHAPE_N = 47, 36
 OBSERVATION_N = SENSORS_N + SHAPE_N
 """Entries of an observation: kind, 24 rest lengths, 18 angular velocities, target and track direction; 12 nodes."""
@@ -271,6 +271,11 @@ EVALUATIONS = _schema(
     *_estimate("stuck_share_by_speed", "1", "stuck by speed"),
     *_estimate("waypoints_per_episode", "1", "waypoints reached"),
     *_estimate("cost", "m2/s2", "running cost"),
+    *_estimate("speed_over_winch_speed", "1", "mean forward speed over the largest rate of a rest length"),
+    *_estimate("bar_lengths_per_s", "1/s", "mean forward speed in bar lengths"),
+    *_estimate("cost_of_transport", "1", "work of the winches over weight times path of the centre of mass"),
+    *_estimate("slip_per_metre", "1", "path that feet slide over path of the centre of mass"),
+    *_estimate("sunk_cable_share", "1", "share of rows 1 .. T in which a cable lies more than 2 cm below the ground"),
 )
 EVALUATION_EPISODES = _of_evaluations(EPISODES)
 EVALUATION_FRAMES = _of_evaluations(FRAMES)

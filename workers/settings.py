@@ -14,7 +14,7 @@ HALF_DIAMETER_M = 1.084492969087398
 (Sec. IV-A), which may also mean their diameter: the radius would then be half of this."""
 
 
-def _none_for(old: int | str) -> BeforeValidator:
+def _none_for(old: float | str) -> BeforeValidator:
     """Reads `old` as None: it says so where TOML has no null, and in configurations of older runs."""
     return BeforeValidator(lambda value: None if type(value) is type(old) and value == old else value)
 
@@ -24,6 +24,8 @@ Doubt = Literal["extent", "range", "step", "flat"]
 """What is doubtful about a ground's file (`workers.ground.sense`, docs/physics.md)."""
 
 Directions = Annotated[Annotated[int, Field(ge=1, le=360)] | None, _none_for(0)]
+StallTension = Annotated[Annotated[float, Field(ge=100.0, le=20000.0)] | None, _none_for(0), _none_for(0.0)]
+Cable = Annotated[int, Field(ge=0, le=23)]
 
 
 class RobotSettings(Settings):
@@ -33,11 +35,18 @@ class RobotSettings(Settings):
     bar_radius_m: float = Field(0.05, ge=0.01, le=0.1, description="collision radius of a bar (m)")
     axial_inertia_kg_m2: float = Field(0.06, ge=0.01, le=1.0, description="inertia of a bar about its axis")
     axial_damping_n_m_s: float = Field(0.3, ge=0.0, le=5.0, description="torque against spin about the axis per rad/s")
+    attachment_span_m: float = Field(
+        1.94, ge=1.2, le=1.94, description="from where cables attach at one end of a bar to where at the other (m)"
+    )
     cable_stiffness_n_per_m: float = Field(2000.0, ge=500.0, le=5000.0, description="cable stiffness (N/m)")
     cable_damping_n_s_per_m: float = Field(50.0, ge=0.0, le=500.0, description="damping, clipped at the elastic force")
     cable_max_tension_n: float = Field(1500.0, ge=200.0, le=10000.0, description="largest tension (N)")
     pretension_n: float = Field(200.0, ge=50.0, le=1000.0, description="tension at the neutral shape (N)")
     winch_speed_m_per_s: float = Field(0.35, ge=0.01, le=2.0, description="largest rate of change of a rest length")
+    winch_stall_n: StallTension = Field(
+        None, description="tension that stops a winch, which hauls the slower the nearer it is (N); none: same speed"
+    )
+    dead_winch: Cable | None = Field(None, description="cable whose winch never moves, 0 .. 23")
     shortest_command_m: float = Field(0.5, ge=0.4, le=1.2, description="lower end of commanded rest lengths (m)")
     longest_command_m: float = Field(1.5, ge=0.8, le=1.6, description="upper end of commanded rest lengths (m)")
     friction: float = Field(1.0, ge=0.05, le=1.5, description="effective coefficient between bars and ground")
@@ -104,6 +113,9 @@ class RandomisationSettings(Settings):
     friction_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the friction")
     winch_speed_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the winch speed")
     sensor_noise: float = Field(0.0, ge=0.0, le=1.0, description="noise on every reading (units of the observation)")
+    sensor_bias: float = Field(
+        0.0, ge=0.0, le=1.0, description="standard deviation of an error of every reading that lasts an episode (same)"
+    )
     largest_delay_steps: int = Field(0, ge=0, le=10, description="largest delay of commands (control steps)")
 
 

@@ -136,7 +136,7 @@ def _kind(annotation: object) -> pa.DataType:
 
 
 def _estimates() -> Iterator[pa.Field]:
-    units = {"forward_speed_m_per_s": "m/s", "cost": "m2/s2"}
+    units = {"forward_speed_m_per_s": "m/s", "cost": "m2/s2", "bar_lengths_per_s": "1/s"}
     yield scalar("evaluation_seed", pa.int64(), "1", "seed of the evaluation that ended the training", nullable=True)
     for name in evaluation.EVALUATED:
         unit = units.get(name, "1")

@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import TYPE_CHECKING
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.service import seeding
@@ -20,7 +19,7 @@ from t6gps.service.seeding import Branch
 from t6gps.service.studies.declared import Baseline
 from t6gps.service.studies.watcher import Progress, Watcher
 from t6gps.service.training import evaluation, evaluation_records, origin, session
-from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.training.evaluation import Evaluation, Judged
 from t6gps.service.training.evaluation_records import Occasion, Purpose
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint, durable
@@ -75,14 +74,14 @@ def evaluate(
     config = origin.configured(run, overrides)
     nominal_m = nominal_rest_length(config.robot)
     control = gaits.flop(nominal_m) if baseline is Baseline.FLOP else gaits.waves(nominal_m, _kept_gait(run))
-    size, summaries = config.run, list[pa.Table]()
+    size, found = config.run, list[Judged]()
     plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
     with PyBulletEngine(config.robot) as simulation, evaluation_records.collecting(run) as episodes:
         for plan in plans:
             episode = controlled(simulation, config.rollout, plan, control, 0, nominal_m)
-            summaries.append(episode.summary)
+            found.append(evaluation.judged(episode, config))
             episodes.append(episode)
-        result = evaluation.summarise(summaries, size.seed)
+        result = evaluation.summarise(found, size.seed)
         purpose = Purpose.TRAINING if condition is None else Purpose.CONDITION
         evaluation_records.commit(run, config, result, episodes, Occasion(purpose, condition), 0)
     return result

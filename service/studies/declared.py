@@ -158,6 +158,8 @@ CHANGED_WORLDS = {
     "rough-incline-10": ("terrain.tilt_deg=10",),
     "friction-0.5": ("robot.friction=0.5",),
     "friction-0.75": ("robot.friction=0.75",),
+    "waypoint-0.54": ("task.waypoint_radius_m=0.54",),
+    "friction-0.5-waypoint-0.54": ("robot.friction=0.5", "task.waypoint_radius_m=0.54"),
     "mass-4": ("robot.bar_mass_kg=4",),
     "mass-8": ("robot.bar_mass_kg=8",),
     "stiffness-1500": ("robot.cable_stiffness_n_per_m=1500",),

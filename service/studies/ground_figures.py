@@ -121,7 +121,7 @@ def climb(finished: Sequence[Finished]) -> Figure:
     """Snapshots of the largest climb by the project's own renderer, and the height along it (paper Sec. V-C)."""
     climb_ = largest_climb(finished)
     config = climb_.outcome.trial.config
-    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
     title = f"{climb_.outcome.run.name}, episode {climb_.episode_id}, {climb_.shown.gain_m:.2f} m up"
     return snapshots(climb_.frames, climb_.terrain, climb_.shown, sizes, title)
 

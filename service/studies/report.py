@@ -33,6 +33,14 @@ ITERATION_COLUMNS = (
     "predicted_cost_change",
     "action_change_m",
 )
+MEANING = {
+    "speed_over_winch_speed": ("over winch speed", 2, 1),
+    "bar_lengths_per_s": ("bar lengths per s", 3, 1),
+    "cost_of_transport": ("cost of transport", 2, 1),
+    "slip_per_metre": ("slip (m per m)", 2, 1),
+    "sunk_cable_share": ("a cable in the ground (%)", 1, 100),
+}
+"""What tables say of a speed: heading, digits and factor."""
 DURATIONS = ("segmenting_s", "fitting_s", "backward_pass_s", "supervised_s")
 
 
@@ -131,13 +139,14 @@ def condition_table(finished: Sequence[Finished]) -> str:
     for row in condition_rows(finished):
         groups.setdefault((row["arm"], row["condition"]), []).append(row)
     lines = [
-        "| arm | condition | speed to the waypoint (m/s) | stuck: below 5 cm in 1 s (%) | cost |",
-        "|---|---|---|---|---|",
+        f"| arm | condition | speed to the waypoint (m/s) | {_meanings()} | stuck: below 5 cm in 1 s (%) | cost |",
+        "|---" * (5 + len(MEANING)) + "|",
     ]
     for (arm, condition), rows in groups.items():
         spread = spread_of(rows)
-        cells = (("forward_speed_m_per_s", 3, 1), ("stuck_share_by_distance", 1, 100), ("cost", 3, 1))
-        lines.append(f"| {arm} | {condition} | {' | '.join(_spread(spread, *cell) for cell in cells)} |")
+        last = (_spread(spread, "stuck_share_by_distance", 1, 100), _spread(spread, "cost", 3))
+        cells = (_spread(spread, "forward_speed_m_per_s", 3), *_meaning(spread), *last)
+        lines.append(f"| {arm} | {condition} | {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
 
 
@@ -162,9 +171,9 @@ def _write_csv(path: Path, rows: Sequence[Row]) -> None:
 def markdown(arms: Sequence[Row]) -> str:
     """The table of arms: noise-free policies, mean +- standard deviation between seeds."""
     lines = [
-        "| arm | seeds | steps | speed to the waypoint (m/s) | waypoints per episode "
+        f"| arm | seeds | steps | speed to the waypoint (m/s) | {_meanings()} | waypoints per episode "
         "| stuck: below 5 cm in 1 s (%) | below 0.05 m/s (%) | cost | modes | learning (s) |",
-        "|---|---|---|---|---|---|---|---|---|---|",
+        "|---" * (10 + len(MEANING)) + "|",
     ]
     for row in arms:
         cells = [
@@ -172,6 +181,7 @@ def markdown(arms: Sequence[Row]) -> str:
             str(row["seeds"]),
             f"{row['steps']:,}",
             _spread(row, "forward_speed_m_per_s", 3),
+            *_meaning(row),
             _spread(row, "waypoints_per_episode", 2),
             _spread(row, "stuck_share_by_distance", 1, 100),
             _spread(row, "stuck_share_by_speed", 1, 100),
@@ -181,6 +191,15 @@ def markdown(arms: Sequence[Row]) -> str:
         ]
         lines.append(f"| {' | '.join(cells)} |")
     return "\n".join(lines) + "\n"
+
+
+def _meanings() -> str:
+    return " | ".join(heading for heading, _, _ in MEANING.values())
+
+
+def _meaning(row: Row) -> list[str]:
+    """The cells of MEANING."""
+    return [_spread(row, key, digits, factor) for key, (_, digits, factor) in MEANING.items()]
 
 
 def _spread(row: Row, key: str, digits: int, factor: float = 1.0) -> str:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, fields
 from pathlib import Path
 
 import pyarrow as pa
@@ -17,15 +17,22 @@ from t6gps.storage import durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, PolicySnapshot
+from t6gps.workers.locomotion.measures import Measures, measures
 
-EVALUATED = {
+RECORDED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
     "stuck_share_by_distance": "stuck_share_by_distance",
     "stuck_share_by_speed": "stuck_share",
     "waypoints_per_episode": "waypoints_reached",
     "cost": "cost",
 }
-"""Reported quantities and the columns of `episodes` they summarise."""
+"""Quantities that the row of an episode holds, and their columns in `episodes`."""
+
+EVALUATED = (*RECORDED, *(field.name for field in fields(Measures)))
+"""Reported quantities: those, and what is measured along the frames of an episode."""
+
+Judged = Mapping[str, float | None]
+"""The quantities of one episode, by name."""
 
 
 @dataclass(frozen=True)
@@ -49,6 +56,8 @@ class Evaluation:
                                 that rocks on the spot is not
     waypoints_per_episode       waypoints reached before their time was up; None where the task has directions
     cost                        mean running cost (m2/s2)
+
+    The others are means over episodes of `workers.locomotion.measures.Measures`.
     """
 
     episodes: int
@@ -58,6 +67,11 @@ class Evaluation:
     stuck_share_by_speed: Estimate = Estimate()
     waypoints_per_episode: Estimate = Estimate()
     cost: Estimate = Estimate()
+    speed_over_winch_speed: Estimate = Estimate()
+    bar_lengths_per_s: Estimate = Estimate()
+    cost_of_transport: Estimate = Estimate()
+    slip_per_metre: Estimate = Estimate()
+    sunk_cable_share: Estimate = Estimate()
 
     def estimates(self) -> dict[str, Estimate]:
         """The quantities by name, in the order of EVALUATED."""
@@ -90,27 +104,32 @@ def evaluate(
     """Run a policy, by default the learner's newest, in `episodes` noise-free episodes; each is handed to `append`."""
     snapshot = executor.learner.policy() if policy is None else policy
     plans = seeding.evaluation_plans(config, episodes, seed, terrain_seed, snapshot.version)
-    summaries: dict[int, pa.Table] = {}
+    found: dict[int, Judged] = {}
 
     def keep(episode: Episode) -> None:
-        copy = episode.summary.take([0])  # the episode's memory is not held
-        summaries[copy["index"][0].as_py()] = copy
+        found[episode.summary["index"][0].as_py()] = judged(episode, config)
         if append is not None:
             append(episode)
-        observer.progress(snapshot.version, "evaluate", len(summaries), episodes)
+        observer.progress(snapshot.version, "evaluate", len(found), episodes)
 
     executor.sample(plans, snapshot, keep, Purpose.EVALUATION)
-    if not summaries:
+    if not found:
         where = executor.run.bundles if executor.run else "the log"
         raise RunError(f"every episode of the evaluation is quarantined; see {where}, mend the cause, then try again")
-    return summarise([summaries[index] for index in sorted(summaries)], seed)
+    return summarise([found[index] for index in sorted(found)], seed)
 
 
-def summarise(summaries: Sequence[pa.Table], seed: int) -> Evaluation:
-    """The evaluation that episodes (rows of `episodes`) make up."""
-    table = pa.concat_tables(summaries)
-    estimates = {name: Estimate(*mean_and_error(table[column])) for name, column in EVALUATED.items()}
-    return Evaluation(episodes=len(summaries), seed=seed, **estimates)
+def judged(episode: Episode, config: Config) -> Judged:
+    """The quantities of an episode that was run in the world of a configuration."""
+    recorded = {name: episode.summary[column][0].as_py() for name, column in RECORDED.items()}
+    return {**recorded, **asdict(measures(episode, config.rollout))}
+
+
+def summarise(episodes: Sequence[Judged], seed: int) -> Evaluation:
+    """The evaluation that episodes make up."""
+    values = {name: pa.chunked_array([[row[name] for row in episodes]], pa.float64()) for name in EVALUATED}
+    estimates = {name: Estimate(*mean_and_error(column)) for name, column in values.items()}
+    return Evaluation(episodes=len(episodes), seed=seed, **estimates)
 
 
 def keep(run: Run, evaluation: Evaluation, condition: str | None = None) -> None:

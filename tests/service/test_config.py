@@ -27,6 +27,7 @@ def test_the_presets_of_the_paper_have_its_sizes() -> None:
         "paper-quick",
         "rough",
         "rough-quick",
+        "superball-v2",
     ]
     rough, flat, paper = load("rough"), load("flat"), load("paper")
     assert (paper.run.episodes, paper.run.steps, paper.run.iterations) == (300, 250, 5)

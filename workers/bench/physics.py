@@ -46,8 +46,9 @@ def _reference_control_step(client: int, bodies: list[int], start: RobotState, c
     rest_lengths, bare_s = start.rest_lengths, 0.0
     begin = time.perf_counter()
     for _ in range(round(CONTROL_STEP_S / robot.physics_step_s)):
-        rest_lengths = move_winches(rest_lengths, command, robot)
-        apply_loads(client, bodies, read_state(client, bodies, rest_lengths), robot)
+        state = move_winches(read_state(client, bodies, rest_lengths), command, robot)
+        apply_loads(client, bodies, state, robot)
+        rest_lengths = state.rest_lengths
         bare_s += _seconds(partial(pybullet.stepSimulation, physicsClientId=client))
     return time.perf_counter() - begin, bare_s
 

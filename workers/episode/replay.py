@@ -12,10 +12,8 @@ from collections.abc import Callable, Collection, Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
-import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.storage import schema
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.episode import policy, streams
 from t6gps.workers.episode.randomisation import draw
@@ -25,15 +23,14 @@ from t6gps.workers.episode.running import RunningEpisode
 from t6gps.workers.episode.streams import Stream
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
 from t6gps.workers.physics.observer import observe, steer, survey
+from t6gps.workers.robot.recorded import numbers, states
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, enter
 from t6gps.workers.robot.symmetry import CABLES_FROM, NODES_FROM, frame_yaw, world_map
-from t6gps.workers.robot.topology import BARS_N, CABLES_N, FACE_KINDS
+from t6gps.workers.robot.topology import CABLES_N, FACE_KINDS
 from t6gps.workers.settings import RolloutSettings
 
 Array = NDArray[np.float64]
-BARS = ("bar_positions", "bar_orientations", "bar_velocities", "bar_angular_velocities")
-"""Columns of `frames` that hold the bars, side by side as in `RobotState.bars`."""
 
 
 @dataclass(frozen=True)
@@ -66,25 +63,17 @@ def recorded(episode: Episode, plan: EpisodePlan, settings: RolloutSettings) -> 
     """An episode of the tables, by its plan and the settings of its run."""
     frames = episode.frames
     robot, delay_steps = draw(settings.robot, settings.randomisation, streams.generator(plan.seed, Stream.ROBOT))
-    parts = [_numbers(frames, name).reshape(frames.num_rows, BARS_N, -1) for name in BARS]
-    element = _numbers(frames, "element").astype(np.int64)
-    rest_lengths = np.empty((len(element), CABLES_N))
-    np.put_along_axis(rest_lengths, CABLES_FROM[element], _numbers(frames, "rest_lengths"), axis=1)
     return Recorded(
         plan=plan,
         settings=settings.model_copy(update={"robot": robot}),
         delay_steps=delay_steps,
-        state=RobotState(np.concatenate(parts, axis=-1), rest_lengths),
-        face=_numbers(frames, "face").astype(np.int64),
-        element=element,
-        entry_edge=_numbers(frames, "entry_edge"),
-        action=_numbers(frames, "action"),
-        waypoint=np.stack([_numbers(frames, f"waypoint_{axis}_m") for axis in "xy"], axis=1),
+        state=states(frames),
+        face=numbers(frames, "face").astype(np.int64),
+        element=numbers(frames, "element").astype(np.int64),
+        entry_edge=numbers(frames, "entry_edge"),
+        action=numbers(frames, "action"),
+        waypoint=np.stack([numbers(frames, f"waypoint_{axis}_m") for axis in "xy"], axis=1),
     )
-
-
-def _numbers(frames: pa.Table, name: str) -> Array:
-    return np.asarray(schema.array(frames, name), dtype=np.float64)
 
 
 def staged(episodes: Iterable[Recorded]) -> Iterator[tuple[Recorded, PyBulletEngine]]:

@@ -8,6 +8,7 @@ from math import hypot
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.storage.schema import OBSERVATION_N
 from t6gps.workers.episode.start import random_start, rest_start
 from t6gps.workers.episode.streams import Stream, generator
 from t6gps.workers.episode.task import Course, one_direction, random_waypoints
@@ -23,7 +24,7 @@ class RunningEpisode(Unique):
 
     state, frame, yaw_rad     the present state, its support triangle, and the turn of its frame
     waypoint, target          active waypoint (m) and the horizontal unit vector to it, x and y in the world
-    observation               what a policy may see now [83], with the noise of the sensors if they have any
+    observation               what a policy may see now [83], with noise and bias of the sensors if they have any
     course                    progress along the waypoints
     ground                    None for the endless plane
     noise_rng                 the stream for exploration; start and course have streams of their own
@@ -52,9 +53,10 @@ class RunningEpisode(Unique):
         self.ground = ground(settings.terrain, terrain_seed, terrain_difficulty)
         engine.set_ground(self.ground)
         self._engine = engine
-        self._sensor_noise = settings.randomisation.sensor_noise
+        self._sensor_noise, bias = settings.randomisation.sensor_noise, settings.randomisation.sensor_bias
         if self._sensor_noise:
             self._sensor_rng = generator(seed, Stream.SENSORS)
+        self._bias = bias * _readings(generator(seed, Stream.BIAS)) if bias else None
         self._nominal_m = nominal_m
         self._step = 0
         if task.directions is not None:
@@ -86,6 +88,13 @@ class RunningEpisode(Unique):
         distance = hypot(way_x, way_y)
         self.target = (way_x / distance, way_y / distance)
         self.yaw_rad, self.observation = observe(self.state, self.frame, self.target, self._nominal_m)
+        readings = self.observation[1:]  # the support triangle is known
         if self._sensor_noise:
-            readings = self.observation[1:]  # the support triangle is known
-            readings += self._sensor_noise * self._sensor_rng.standard_normal(len(readings), dtype=np.float32)
+            readings += self._sensor_noise * _readings(self._sensor_rng)
+        if self._bias is not None:
+            readings += self._bias
+
+
+def _readings(rng: np.random.Generator) -> NDArray[np.float32]:
+    """A standard normal number for each reading."""
+    return rng.standard_normal(OBSERVATION_N - 1, dtype=np.float32)

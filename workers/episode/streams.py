@@ -16,6 +16,7 @@ class Stream(IntEnum):
     EXPLORATION   noise on the commands
     ROBOT         mass, stiffness, friction, winches and delay, where they are randomised
     SENSORS       noise of the sensors
+    BIAS          their errors that last
     """
 
     START = 0
@@ -23,6 +24,7 @@ class Stream(IntEnum):
     EXPLORATION = 2
     ROBOT = 3
     SENSORS = 4
+    BIAS = 5
 
 
 def generator(seed: int, stream: Stream) -> np.random.Generator:

@@ -52,6 +52,14 @@ class Terrain:
         above = np.hypot(over_y - corner, far - over_y)
         return np.degrees(np.arctan(np.where(a >= b, below, above) / self.cell_m))
 
+    def normal(self, x: Array | float, y: Array | float) -> Array:
+        """Upward unit normals [..., 3] of the triangles at x, y (m, equal shapes); beyond the sides, as `height`."""
+        corner, over_x, over_y, far, a, b = self._cells(x, y)
+        rise_x = np.where(a >= b, over_x - corner, far - over_y)
+        rise_y = np.where(a >= b, far - over_x, over_y - corner)
+        normal = np.stack([-rise_x, -rise_y, np.full_like(rise_x, self.cell_m)], axis=-1)
+        return np.asarray(normal / np.linalg.norm(normal, axis=-1, keepdims=True))
+
     def _cells(self, x: Array | float, y: Array | float) -> tuple[Array, ...]:
         """Heights of the cells' four corners, and the shares of the way over x and y.
 

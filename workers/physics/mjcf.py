@@ -84,8 +84,8 @@ def _add_bars(world: ElementTree.Element, robot: RobotSettings, height_m: float)
         _add(body, "inertial", pos=(0, 0, 0), mass=robot.bar_mass_kg, diaginertia=inertia)
         _add(body, "geom", type="capsule", size=(robot.bar_radius_m, BAR_LENGTH_M / 2), rgba=_BAR_COLOR)
         _add(body, "site", name=f"bar_{bar}")
-        _add(body, "site", name=f"node_{first}", pos=(0, 0, BAR_LENGTH_M / 2))
-        _add(body, "site", name=f"node_{second}", pos=(0, 0, -BAR_LENGTH_M / 2))
+        _add(body, "site", name=f"node_{first}", pos=(0, 0, robot.attachment_span_m / 2))
+        _add(body, "site", name=f"node_{second}", pos=(0, 0, -robot.attachment_span_m / 2))
 
 
 def _add_cables(root: ElementTree.Element, robot: RobotSettings) -> None:

@@ -58,9 +58,10 @@ class MujocoStepper(Unique):
     def control_step(self, rest_lengths: Array, command: Array) -> RobotState:
         """State after one control step under `command` [24] (m)."""
         for _ in range(self._steps_n):
-            rest_lengths = move_winches(rest_lengths, command, self._robot)
-            self.data.xfrc_applied[1:] = np.hstack(loads(self.state(rest_lengths), self._robot))
+            state = move_winches(self.state(rest_lengths), command, self._robot)
+            self.data.xfrc_applied[1:] = np.hstack(loads(state, self._robot))
             mujoco.mj_step(self.model, self.data)
+            rest_lengths = state.rest_lengths
         return self.state(rest_lengths)
 
 

@@ -19,8 +19,8 @@ class ReferenceStepper(Unique):
     def control_step(self, bodies: list[int], rest_lengths: Array, command: Array) -> RobotState:
         """State after one control step under `command` [24] (m)."""
         for _ in range(self._steps_n):
-            rest_lengths = move_winches(rest_lengths, command, self._robot)
-            state = read_state(self._client, bodies, rest_lengths)
+            state = move_winches(read_state(self._client, bodies, rest_lengths), command, self._robot)
             apply_loads(self._client, bodies, state, self._robot)
             pybullet.stepSimulation(physicsClientId=self._client)
+            rest_lengths = state.rest_lengths
         return read_state(self._client, bodies, rest_lengths)

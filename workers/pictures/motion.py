@@ -8,11 +8,8 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
-from t6gps.storage import schema
 from t6gps.workers.physics.cables import tensions
-from t6gps.workers.robot.state import RobotState
-from t6gps.workers.robot.symmetry import CABLE_MAP
-from t6gps.workers.robot.topology import BARS_N, CABLES_N
+from t6gps.workers.robot.recorded import in_order, states
 from t6gps.workers.settings import RobotSettings
 
 Array = NDArray[np.float64]
@@ -24,6 +21,7 @@ class Motion:
 
     com            centre of mass [T + 1, 3] (m)
     nodes          ends of the bars [T + 1, 12, 3] (m)
+    attached       where cables attach near those ends [T + 1, 12, 3] (m)
     rest_lengths   of the cables [T + 1, 24] (m)
     commands       commanded rest lengths, for rows with an action [T, 24] (m)
     tensions       of the cables, by the law of the simulation [T + 1, 24] (N)
@@ -31,6 +29,7 @@ class Motion:
 
     com: Array
     nodes: Array
+    attached: Array
     rest_lengths: Array
     commands: Array
     tensions: Array
@@ -38,22 +37,12 @@ class Motion:
 
 def motion(frames: pa.Table, robot: RobotSettings) -> Motion:
     """The motion of an episode's robot, which `robot` describes, from its frames."""
-    cable_of = CABLE_MAP[schema.array(frames, "element")]
-    parts = (("positions", 3), ("orientations", 4), ("velocities", 3), ("angular_velocities", 3))
-    bars = [numbers(frames, f"bar_{part}").reshape(-1, BARS_N, n) for part, n in parts]
-    rest_lengths = np.take_along_axis(numbers(frames, "rest_lengths").reshape(-1, CABLES_N), cable_of, axis=1)
-    state = RobotState(np.concatenate(bars, axis=-1), rest_lengths)
-    actions = numbers(frames, "action").reshape(-1, CABLES_N)
-    rows = (RobotState(*row) for row in zip(state.bars, state.rest_lengths, strict=True))
+    state = states(frames)
     return Motion(
         com=state.com,
         nodes=state.nodes(),
+        attached=state.nodes(robot.attachment_span_m),
         rest_lengths=state.rest_lengths,
-        commands=np.take_along_axis(actions, cable_of[: len(actions)], axis=1),
-        tensions=np.array([tensions(row, robot)[0] for row in rows]),
+        commands=in_order(frames, "action"),
+        tensions=tensions(state, robot)[0],
     )
-
-
-def numbers(frames: pa.Table, name: str) -> Array:
-    """A column without its nulls, as 64-bit floats."""
-    return np.asarray(schema.array(frames, name), dtype=np.float64)

@@ -12,8 +12,8 @@ from numpy.typing import NDArray
 from t6gps.storage import schema
 from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures.landscape import Landscape
-from t6gps.workers.pictures.motion import numbers
 from t6gps.workers.pictures.raycast import Camera
+from t6gps.workers.robot.recorded import numbers
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.topology import BARS, BARS_N, CABLES, CABLES_N
 from t6gps.workers.settings import HALF_DIAMETER_M, RobotSettings
@@ -69,10 +69,11 @@ TRACK_RADIUS_M = 0.02
 
 @dataclass(frozen=True)
 class Sizes:
-    """What an episode's frames do not hold: radii of a bar and of the circle around a waypoint (m)."""
+    """What an episode's frames do not hold (m): radii of a bar and of a waypoint's circle, and where cables attach."""
 
     bar_radius_m: float = RobotSettings().bar_radius_m
     waypoint_radius_m: float = HALF_DIAMETER_M
+    attachment_span_m: float = RobotSettings().attachment_span_m
 
 
 USUAL = Sizes()
@@ -95,7 +96,8 @@ class Rods:
 class Scene:
     """An episode on its ground, seen in the fixed horizontal direction `forward` [2] from `eyes` [T + 1, 3] (m).
 
-    com [T + 1, 3], nodes [T + 1, 12, 3], waypoint [T + 1, 2] (m); `sun` is the unit vector to the sun.
+    com [T + 1, 3], nodes and points where cables attach [T + 1, 12, 3], waypoint [T + 1, 2] (m); `sun` is the unit
+    vector to the sun.
     """
 
     landscape: Landscape
@@ -104,6 +106,7 @@ class Scene:
     eyes: Array
     com: Array
     nodes: Array
+    attached: Array
     face: Ints
     kind: Ints
     waypoint: Array
@@ -122,6 +125,7 @@ class Scene:
         """Bars with their caps, cables, the waypoint's flag, and the track of the centre of mass."""
         nodes, track = self.nodes[step], laid(self.com[: step + 1, :2], self.landscape.height)
         first, second = nodes[BARS].swapaxes(0, 1)
+        start, end = self.attached[step][CABLES].swapaxes(0, 1)
         ends = np.concatenate([first, second])
         inward = (second - first) / np.linalg.norm(second - first, axis=1, keepdims=True) * CAP_LENGTH_M
         caps = ends + np.concatenate([inward, -inward])
@@ -131,7 +135,7 @@ class Scene:
         pieces = (
             (first, second, 0.8 * self.sizes.bar_radius_m, BAR),
             (ends, caps, 1.1 * self.sizes.bar_radius_m, CAP),
-            (nodes[CABLES[:, 0]], nodes[CABLES[:, 1]], CABLE_RADIUS_M, CABLE),
+            (start, end, CABLE_RADIUS_M, CABLE),
             (foot, top, POLE_RADIUS_M, POLE),
             (top, top + point, BALL_RADIUS_M, TRACK),
             (track[:-1], track[1:] + point, TRACK_RADIUS_M, TRACK),
@@ -176,6 +180,7 @@ def build(frames: pa.Table, terrain: Terrain | None, steps: Sequence[int], sizes
         eyes=eyes,
         com=com,
         nodes=nodes,
+        attached=state.nodes(sizes.attachment_span_m),
         face=np.asarray(schema.array(frames, "face"), dtype=np.int64),
         kind=np.asarray(schema.array(frames, "kind"), dtype=np.int64),
         waypoint=waypoint,

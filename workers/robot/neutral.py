@@ -13,18 +13,26 @@ from t6gps.workers.settings import RobotSettings
 
 def nominal_rest_length(robot: RobotSettings) -> float:
     """Rest length (m) at which every cable of the neutral shape carries the pretension."""
-    return CABLE_LENGTH_M - robot.pretension_n / robot.cable_stiffness_n_per_m
+    return _share(robot) * CABLE_LENGTH_M - robot.pretension_n / robot.cable_stiffness_n_per_m
+
+
+def _share(robot: RobotSettings) -> float:
+    """Size of the icosahedron that cables and attachment points make, over the one that they make at the bars' ends."""
+    return robot.attachment_span_m / BAR_LENGTH_M
 
 
 @cache
 def neutral_state(robot: RobotSettings, height_m: float = BAR_LENGTH_M / 2 + 0.1) -> RobotState:
-    """The neutral shape at rest, as in topology.NODES_M, with its centre at height `height_m` over the origin."""
+    """The neutral shape at rest, as in topology.NODES_M, with its centre at height `height_m` over the origin.
+
+    Where cables attach nearer to the middle of the bars, the bars lie nearer to each other.
+    """
     first, second = NODES_M[BARS[:, 0]], NODES_M[BARS[:, 1]]
     axes = (first - second) / BAR_LENGTH_M
     # The shortest rotation from z to an axis n is the normalised quaternion (z x n, 1 + z . n); no axis is -z.
     orientations = np.stack([-axes[:, 1], axes[:, 0], np.zeros(BARS_N), 1 + axes[:, 2]], axis=1)
     state = RobotState.of(
-        (first + second) / 2 + [0.0, 0.0, height_m],
+        _share(robot) * (first + second) / 2 + [0.0, 0.0, height_m],
         orientations / np.linalg.norm(orientations, axis=1, keepdims=True),
         np.zeros((BARS_N, 3)),
         np.zeros((BARS_N, 3)),

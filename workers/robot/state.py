@@ -78,22 +78,25 @@ class RobotState:
         """Velocity of the centre of mass [..., 3] (m/s)."""
         return self.bar_velocities.sum(axis=-2) / 6
 
-    def nodes(self) -> Array:
-        """Positions of the nodes [..., 12, 3] (m); the nodes 2b and 2b + 1 end bar b."""
-        return _at_both_ends(self.bar_positions, self.arms())
+    def nodes(self, span_m: float = BAR_LENGTH_M) -> Array:
+        """Positions of the nodes [..., 12, 3] (m); the nodes 2b and 2b + 1 end bar b.
 
-    def node_velocities(self) -> Array:
-        """Velocities of the nodes [..., 12, 3] (m/s)."""
-        return _at_both_ends(self.bar_velocities, cross(self.bar_angular_velocities, self.arms()))
+        With `span_m`, of the points so far apart on each bar, where cables attach for instance.
+        """
+        return _at_both_ends(self.bar_positions, self.arms(span_m))
 
-    def arms(self) -> Array:
-        """From each bar's centre to its first node [..., 6, 3] (m)."""
+    def node_velocities(self, span_m: float = BAR_LENGTH_M) -> Array:
+        """Velocities of the same points [..., 12, 3] (m/s)."""
+        return _at_both_ends(self.bar_velocities, cross(self.bar_angular_velocities, self.arms(span_m)))
+
+    def arms(self, span_m: float = BAR_LENGTH_M) -> Array:
+        """From each bar's centre to the first of these points [..., 6, 3] (m)."""
         x, y, z, w = (self.bar_orientations[..., i] for i in range(4))
         axes = np.empty_like(self.bar_positions)
         axes[..., 0] = x * z + w * y
         axes[..., 1] = y * z - w * x
         axes[..., 2] = 0.5 - x * x - y * y
-        axes *= BAR_LENGTH_M
+        axes *= span_m
         return axes
 
 

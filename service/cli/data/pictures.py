@@ -51,7 +51,7 @@ def render(
         stored = there.episode(run_name, episode, evaluation_id)
         session.tell_changes(run, terminal.warn)
         terrain = _ground(config, stored)
-        sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+        sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
         with terminal.task("rendering") as progress:
             rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
     typer.echo(out)

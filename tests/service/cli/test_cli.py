@@ -6,6 +6,7 @@ import json
 import os
 import signal
 from collections.abc import Callable
+from dataclasses import asdict
 from pathlib import Path
 
 import numpy as np
@@ -17,9 +18,11 @@ from command import started, t6gps
 from run_digest import digests
 from tiny_run import Trained
 
+from t6gps.service import config as configuration
 from t6gps.storage import catalog, tables
 from t6gps.storage.sql import query
 from t6gps.workers.episode import policy as acting
+from t6gps.workers.locomotion.measures import measures
 
 TINY = tiny_run.settings()
 
@@ -52,8 +55,17 @@ def test_eval_prints_the_named_keys_as_json(root: Path) -> None:
         "stuck_share_by_speed",
         "waypoints_per_episode",
         "cost",
+        "speed_over_winch_speed",
+        "bar_lengths_per_s",
+        "cost_of_transport",
+        "slip_per_metre",
+        "sunk_cable_share",
     ):
         assert set(result[key]) == {"mean", "standard_error"}
+    speed = result["forward_speed_m_per_s"]["mean"]
+    assert result["bar_lengths_per_s"]["mean"] == pytest.approx(speed / 1.94)
+    assert result["speed_over_winch_speed"]["mean"] == pytest.approx(speed / 0.35)
+    assert result["cost_of_transport"]["mean"] > 0
 
 
 def test_eval_changes_the_world_but_not_the_policy(root: Path) -> None:
@@ -80,6 +92,10 @@ def test_eval_keeps_the_episodes_of_any_policy_in_any_world(tiny: Trained, tmp_p
     assert query.query(query.Question([run], sql)).to_pylist() == [{"cost": pytest.approx(result["cost"]["mean"])}]
     frames = tables.episode(run, 1, 1).frames
     assert set(frames["policy_version"].to_pylist()) == {1}
+    world = configuration.kept(run, ["terrain.difficulty=0.5"]).rollout
+    of_episodes = [asdict(measures(tables.episode(run, number, 1), world)) for number in (0, 1)]
+    for name in of_episodes[0]:
+        assert row[name] == result[name]["mean"] == pytest.approx(np.mean([found[name] for found in of_episodes]))
     assert frames["ground_slope_deg"].to_numpy().max() > 0
     t6gps("render", "copy", "1", "--evaluation", "1", "--out", tmp_path / "still.png", "--root", tmp_path)
     assert "keeps no evaluation 7; kept: 0, 1" in t6gps(

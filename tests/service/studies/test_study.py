@@ -171,6 +171,9 @@ def test_the_folder_holds_tables_figures_and_how_they_were_made(
     page = (tmp_path / "out" / "README.md").read_text()
     for words in (PAIR.question, "    t6gps study pair", "seeds 0", finished[0].origin.commits[0], "wall time"):
         assert words in page
+    widths = {line.count("|") for line in page.splitlines() if line.startswith("|")}
+    assert len(widths) == 2, "one table of arms, one of conditions, each with as many cells in every row"
+    assert page.count("cost of transport") == 2
     for outcome in finished:
         assert f"t6gps train flat-quick --run {outcome.run.name} --set=" in page
 

@@ -90,3 +90,20 @@ def test_noisy_sensors_blur_what_the_policy_sees_and_nothing_else() -> None:
     assert 0.27 < errors.std() < 0.33 and abs(errors.mean()) < 0.03
     assert np.abs(np.corrcoef(errors[:-1].ravel(), errors[1:].ravel())[0, 1]) < 0.1
     assert episodes[0].frames.drop_columns("observation").equals(episodes[1].frames.drop_columns("observation"))
+
+
+def test_biased_sensors_err_by_the_same_in_every_row_and_otherwise_in_every_episode() -> None:
+    errors = []
+    for seed in (11, 12):
+        seen = []
+        for bias in (0.0, 0.3):
+            worker = RolloutWorker(RolloutSettings(randomisation=RandomisationSettings(sensor_bias=bias)))
+            seen.append(worker.run(replace(PLAN, seed=seed), still_policy()).frames)
+            worker.close()
+        clear, wrong = (schema.array(frames, "observation") for frames in seen)
+        assert seen[0].drop_columns("observation").equals(seen[1].drop_columns("observation"))
+        error = wrong - clear
+        np.testing.assert_allclose(error, np.broadcast_to(error[0], error.shape), atol=1e-6)
+        assert not error[0, 0] and 0.2 < error[0, 1:].std() < 0.4
+        errors.append(error[0])
+    assert np.abs(np.corrcoef(*errors)[0, 1]) < 0.4

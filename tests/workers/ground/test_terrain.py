@@ -86,3 +86,14 @@ def test_a_difficulty_outside_its_range_is_refused(difficulty: float) -> None:
 def test_a_ground_smaller_than_a_cell_is_refused() -> None:
     with pytest.raises(TerrainError, match="m wide"):
         generate(0, 1.0, 0.1)
+
+
+def test_the_normal_stands_on_the_triangle_below() -> None:
+    rng, ground = np.random.default_rng(1), generate(2, 1.0)
+    x, y = rng.uniform(-15, 15, (2, 100))
+    step = 1e-7
+    normal = ground.normal(x, y)
+    np.testing.assert_allclose(np.linalg.norm(normal, axis=1), 1.0)
+    slopes = [(ground.height(x + dx, y + dy) - ground.height(x, y)) / step for dx, dy in ((step, 0.0), (0.0, step))]
+    np.testing.assert_allclose(-normal[:, :2] / normal[:, 2:], np.transpose(slopes), atol=1e-6)
+    np.testing.assert_allclose(np.degrees(np.arccos(normal[:, 2])), ground.slope_deg(x, y))

@@ -197,3 +197,11 @@ def test_a_refusal_writes_nothing(tmp_path: Path, name: str, options: dict[str, 
     with pytest.raises(ConfigError, match=message):
         render(_frames(3), None, tmp_path / name, **options)
     assert not list(tmp_path.iterdir())
+
+
+def test_cables_are_drawn_from_where_they_attach() -> None:
+    drawn = scene.build(_frames(1), None, [0], scene.Sizes(attachment_span_m=1.65)).rods(0)
+    ends = np.stack([drawn.a, drawn.b], axis=1)[drawn.part == scene.CABLE]
+    nodes = neutral_state(RobotSettings()).nodes()
+    gaps = np.linalg.norm(ends[:, :, None] - nodes, axis=-1).min(axis=-1)
+    np.testing.assert_allclose(gaps, (1.94 - 1.65) / 2, atol=1e-6)

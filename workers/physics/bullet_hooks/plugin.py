@@ -9,9 +9,10 @@ import numpy as np
 
 from t6gps.storage.errors import PhysicsError
 from t6gps.workers.physics.bullet import pybullet
+from t6gps.workers.physics.cables import winch_steps
 from t6gps.workers.physics.engine import Unique
 from t6gps.workers.robot.state import Array, RobotState
-from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS_N, CABLES, CABLES_N
+from t6gps.workers.robot.topology import BARS_N, CABLES, CABLES_N
 from t6gps.workers.settings import RobotSettings
 
 _REMEDY = "reinstall t6gps and pybullet 3.2.7, or set T6GPS_PHYSICS=reference (slower, same results)"
@@ -25,12 +26,13 @@ _FAILURES = {
 }
 _BLOCK = np.dtype(
     [
-        ("winch_step_m", "f8"),
+        ("winch_steps_m", "f8", CABLES_N),
+        ("stall", "f8"),
         ("stiffness", "f8"),
         ("damping", "f8"),
         ("max_tension", "f8"),
         ("axial_damping", "f8"),
-        ("bar_length", "f8"),
+        ("span", "f8"),
         ("command", "f8", CABLES_N),
         ("rest", "f8", CABLES_N),
         ("bars", "f8", (BARS_N, 13)),
@@ -63,12 +65,13 @@ class PluginStepper(Unique):
     ) -> None:
         self._client = client
         self._block = np.zeros((), _BLOCK)
-        self._block["winch_step_m"] = robot.winch_speed_m_per_s * robot.physics_step_s
+        self._block["winch_steps_m"] = winch_steps(robot)
+        self._block["stall"] = robot.winch_stall_n or 0.0
         self._block["stiffness"] = robot.cable_stiffness_n_per_m
         self._block["damping"] = robot.cable_damping_n_s_per_m
         self._block["max_tension"] = robot.cable_max_tension_n
         self._block["axial_damping"] = robot.axial_damping_n_m_s
-        self._block["bar_length"] = BAR_LENGTH_M
+        self._block["span"] = robot.attachment_span_m
         self._block["cables"] = CABLES
         self._block["steps_n"] = steps_n
         path = library_path()

@@ -11,7 +11,7 @@ import rerun as rr
 from numpy.typing import NDArray
 
 from t6gps.storage import schema
-from t6gps.workers.pictures.motion import numbers
+from t6gps.workers.robot.recorded import numbers
 
 Ints = NDArray[np.int64]
 

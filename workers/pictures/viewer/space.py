@@ -9,11 +9,12 @@ from numpy.typing import NDArray
 
 from t6gps.storage import schema
 from t6gps.workers.pictures import scene
-from t6gps.workers.pictures.motion import Motion, numbers
+from t6gps.workers.pictures.motion import Motion
 from t6gps.workers.pictures.viewer import colours
 from t6gps.workers.pictures.viewer.ground_mesh import around
 from t6gps.workers.pictures.viewer.rows import Rows
 from t6gps.workers.pictures.viewer.world import World
+from t6gps.workers.robot.recorded import numbers
 from t6gps.workers.robot.topology import BAR_LENGTH_M, BARS_N, CABLES, CABLES_N, FACES, NODES_N
 
 Array = NDArray[np.float64]
@@ -46,7 +47,7 @@ def log_robot(rows: Rows, moved: Motion, world: World) -> None:
     rows.send("world/robot/nodes", nodes.partition([NODES_N] * n))
     rows.log("world/robot/cables", rr.LineStrips3D.from_fields(radii=[scene.CABLE_RADIUS_M]))
     lines = rr.LineStrips3D.columns(
-        strips=moved.nodes[:, CABLES].reshape(-1, 2, 3).astype(np.float32),
+        strips=moved.attached[:, CABLES].reshape(-1, 2, 3).astype(np.float32),
         colors=colours.of_tensions(moved.tensions.ravel(), world.brightest_n),
     )
     rows.send("world/robot/cables", lines.partition([CABLES_N] * n))

@@ -2,7 +2,7 @@
  * One control step of the robot inside Bullet: a plugin for pybullet.loadPlugin(path, "_t6gps").
  *
  * The law is that of workers/physics/cables.py, operation by operation, so that both give the same bits: in every physics
- * step (1) the winches move, (2) the bars are read, (3) forces are computed and applied, (4) Bullet steps.
+ * step (1) the bars are read, (2) the winches move, (3) forces are computed and applied, (4) Bullet steps.
  *
  * Python owns the data (struct block) and binds it once by address. Bullet's C functions come from the library of
  * the pybullet module, looked up at run time; the declarations below are those of PyBullet 3.2.
@@ -37,7 +37,9 @@ struct b3PluginArguments {
 
 /* Shared with workers/physics/bullet_hooks/plugin.py (_BLOCK): the same fields in the same order. */
 struct block {
-    double winch_step_m, stiffness, damping, max_tension, axial_damping, bar_length;
+    double winch_steps_m[CABLES];
+    double stall; /* 0: none */
+    double stiffness, damping, max_tension, axial_damping, span;
     double command[CABLES], rest[CABLES];
     double bars[BARS][13]; /* position, quaternion x y z w, velocity, angular velocity */
     int32_t bodies[BARS];
@@ -146,20 +148,20 @@ static double dot(const double *a, const double *b) { return a[0] * b[0] + a[1] 
 
 static double clip(double value, double bound) { return fmin(fmax(value, -bound), bound); }
 
-static void move_winches(struct block *block) {
-    for (int cable = 0; cable < CABLES; cable++)
-        block->rest[cable] += clip(block->command[cable] - block->rest[cable], block->winch_step_m);
-}
+struct geometry {
+    double axes[BARS][3], arms[BARS][3];
+    double gaps[CABLES][3], lengths[CABLES], rates[CABLES];
+};
 
-static void loads(const struct block *block, double forces[BARS][3], double torques[BARS][3]) {
-    double axes[BARS][3], arms[BARS][3], nodes[NODES][3], speeds[NODES][3], pulls[NODES][3] = {{0}};
+static void survey(const struct block *block, struct geometry *found) {
+    double nodes[NODES][3], speeds[NODES][3];
     for (int bar = 0; bar < BARS; bar++) {
         const double *at = block->bars[bar], *q = at + 3, *velocity = at + 7, *omega = at + 10;
-        double swing[3];
-        arms[bar][0] = (q[0] * q[2] + q[3] * q[1]) * block->bar_length;
-        arms[bar][1] = (q[1] * q[2] - q[3] * q[0]) * block->bar_length;
-        arms[bar][2] = (0.5 - q[0] * q[0] - q[1] * q[1]) * block->bar_length;
-        for (int i = 0; i < 3; i++) axes[bar][i] = arms[bar][i] / (block->bar_length / 2);
+        double(*arms)[3] = found->arms, swing[3];
+        arms[bar][0] = (q[0] * q[2] + q[3] * q[1]) * block->span;
+        arms[bar][1] = (q[1] * q[2] - q[3] * q[0]) * block->span;
+        arms[bar][2] = (0.5 - q[0] * q[0] - q[1] * q[1]) * block->span;
+        for (int i = 0; i < 3; i++) found->axes[bar][i] = arms[bar][i] / (block->span / 2);
         cross(omega, arms[bar], swing);
         for (int i = 0; i < 3; i++) {
             nodes[2 * bar][i] = at[i] + arms[bar][i];
@@ -170,37 +172,59 @@ static void loads(const struct block *block, double forces[BARS][3], double torq
     }
     for (int cable = 0; cable < CABLES; cable++) {
         const int a = block->cables[cable][0], b = block->cables[cable][1];
-        double gap[3], gap_speed[3];
+        double *gap = found->gaps[cable], gap_speed[3];
         for (int i = 0; i < 3; i++) {
             gap[i] = nodes[b][i] - nodes[a][i];
             gap_speed[i] = speeds[b][i] - speeds[a][i];
         }
-        const double length = sqrt(dot(gap, gap));
-        const double rate = dot(gap, gap_speed) / length;
-        const double elastic = block->stiffness * fmax(0.0, length - block->rest[cable]);
-        const double tension = fmin(elastic + clip(block->damping * rate, elastic), block->max_tension);
+        found->lengths[cable] = sqrt(dot(gap, gap));
+        found->rates[cable] = dot(gap, gap_speed) / found->lengths[cable];
+    }
+}
+
+static double tension(const struct block *block, const struct geometry *found, int cable) {
+    const double elastic = block->stiffness * fmax(0.0, found->lengths[cable] - block->rest[cable]);
+    return fmin(elastic + clip(block->damping * found->rates[cable], elastic), block->max_tension);
+}
+
+static void move_winches(struct block *block, const struct geometry *found) {
+    for (int cable = 0; cable < CABLES; cable++) {
+        const double reach = block->winch_steps_m[cable], change = block->command[cable] - block->rest[cable];
+        double hauled = reach;
+        if (block->stall > 0) hauled = reach * fmax(0.0, 1 - tension(block, found, cable) / block->stall);
+        block->rest[cable] += fmin(fmax(change, -hauled), reach);
+    }
+}
+
+static void loads(const struct block *block, const struct geometry *found, double forces[BARS][3],
+                  double torques[BARS][3]) {
+    double pulls[NODES][3] = {{0}};
+    for (int cable = 0; cable < CABLES; cable++) {
+        const int a = block->cables[cable][0], b = block->cables[cable][1];
+        const double pulling = tension(block, found, cable);
         for (int i = 0; i < 3; i++) {
-            const double pull = tension / length * gap[i];
+            const double pull = pulling / found->lengths[cable] * found->gaps[cable][i];
             pulls[a][i] += pull;
             pulls[b][i] -= pull;
         }
     }
     for (int bar = 0; bar < BARS; bar++) {
         const double *first = pulls[2 * bar], *second = pulls[2 * bar + 1];
-        const double spin_torque = block->axial_damping * dot(block->bars[bar] + 10, axes[bar]);
+        const double spin_torque = block->axial_damping * dot(block->bars[bar] + 10, found->axes[bar]);
         double couple[3];
         for (int i = 0; i < 3; i++) {
             forces[bar][i] = first[i] + second[i];
             couple[i] = first[i] - second[i];
         }
-        cross(arms[bar], couple, torques[bar]);
-        for (int i = 0; i < 3; i++) torques[bar][i] -= spin_torque * axes[bar][i];
+        cross(found->arms[bar], couple, torques[bar]);
+        for (int i = 0; i < 3; i++) torques[bar][i] -= spin_torque * found->axes[bar][i];
     }
 }
 
-static void apply_loads(const struct bullet *bullet, client_handle client, const struct block *block) {
+static void apply_loads(const struct bullet *bullet, client_handle client, const struct block *block,
+                        const struct geometry *found) {
     double forces[BARS][3], torques[BARS][3];
-    loads(block, forces, torques);
+    loads(block, found, forces, torques);
     for (int bar = 0; bar < BARS; bar++) { /* one load per command: Bullet mixes up several forces in one */
         const int body = block->bodies[bar];
         command_handle command = bullet->b3ApplyExternalForceCommandInit(client);
@@ -215,9 +239,11 @@ static void apply_loads(const struct bullet *bullet, client_handle client, const
 static int control_step(struct stepper *stepper, client_handle client) {
     const struct bullet *bullet = &stepper->bullet;
     for (int step = 0; step < stepper->block->steps_n; step++) {
-        move_winches(stepper->block);
+        struct geometry found;
         if (read_bars(stepper, client) != DONE) return REFUSED;
-        apply_loads(bullet, client, stepper->block);
+        survey(stepper->block, &found);
+        move_winches(stepper->block, &found);
+        apply_loads(bullet, client, stepper->block, &found);
         submit(bullet, client, bullet->b3InitStepSimulationCommand(client));
     }
     return read_bars(stepper, client);
