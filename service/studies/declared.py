@@ -127,7 +127,8 @@ ROUGH_SIZES = {Scale.QUICK: ("run.iterations=10",), Scale.PAPER: ("run.iteration
 ROUGH = Arm("T6-GPS", "rough ground", "rough", sizes=ROUGH_SIZES)
 """The headline run."""
 
-RIVALS_SIZE = ("run.iterations=15", "run.episodes=100")
+RIVALS_EVALUATION = "run.evaluation_episodes=80"
+RIVALS_SIZE = ("run.iterations=15", "run.episodes=100", RIVALS_EVALUATION)
 STATES = ("com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables")
 REDUCED_STATES = {state: (f"learner.reduced_state={state}",) for state in STATES}
 HORIZONS = {f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}
@@ -327,15 +328,15 @@ STUDIES = {
             },
         },
         paper_arms={
-            f"t6gps-{episodes * 2500 // 1000}k": Arm(
-                f"T6-GPS, {episodes * 2500:,} steps",
+            f"t6gps-{steps}k": Arm(
+                f"T6-GPS, {steps},000 steps",
                 "rough ground",
                 "rough",
-                ("run.iterations=10", f"run.episodes={episodes}"),
+                ("run.iterations=10", f"run.episodes={episodes}", RIVALS_EVALUATION),
             )
-            for episodes in (30, 50)
+            for steps, episodes in ((75, 30), (125, 50))
         },
-        quick=("run.episodes=3", "run.iterations=10", "run.evaluation_episodes=20"),
+        quick=("run.episodes=4", "run.iterations=10", "run.evaluation_episodes=20"),
         quick_seeds=1,
     ),
     "transfer": Study(

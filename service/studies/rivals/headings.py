@@ -6,8 +6,6 @@ action value of T6-GPS learns in the same way (`learner.improvers.action_value`)
 
 from __future__ import annotations
 
-from typing import Any
-
 import numpy as np
 import torch
 from gymnasium import spaces
@@ -15,7 +13,7 @@ from stable_baselines3.common.buffers import ReplayBuffer
 from stable_baselines3.common.type_aliases import ReplayBufferSamples
 from stable_baselines3.common.vec_env import VecNormalize
 
-from t6gps.service.studies.rivals.environment import FRAMES
+from t6gps.service.studies.rivals.environment import FRAMES, Info
 from t6gps.service.studies.rivals.senses import VELOCITY, Array, reward
 from t6gps.storage.schema import TARGET
 from t6gps.workers.settings import TaskSettings
@@ -30,18 +28,20 @@ class HeadingBuffer(ReplayBuffer):
     def __init__(
         self,
         buffer_size: int,
-        observation_space: spaces.Space[Any],
-        action_space: spaces.Space[Any],
+        observation_space: spaces.Box,
+        action_space: spaces.Box,
+        device: torch.device | str = "cpu",
+        n_envs: int = 1,
+        optimize_memory_usage: bool = False,
         *,
         task: TaskSettings,
         rng: np.random.Generator,
-        **others: Any,
     ) -> None:
-        super().__init__(buffer_size, observation_space, action_space, **others)
+        super().__init__(buffer_size, observation_space, action_space, device, n_envs, optimize_memory_usage)
         self._task, self._rng = task, rng
         self._frames = np.zeros((self.buffer_size, 4))
 
-    def add(self, obs: Array, next_obs: Array, action: Array, reward: Array, done: Array, infos: list[Any]) -> None:
+    def add(self, obs: Array, next_obs: Array, action: Array, reward: Array, done: Array, infos: list[Info]) -> None:
         """Keep a transition, and how its frames lie in the world."""
         self._frames[self.pos] = infos[0][FRAMES]
         super().add(obs, next_obs, action, reward, done, infos)

@@ -5,8 +5,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 MARKS = (10_000, 25_000, 75_000, 125_000)
-"""Control steps of a training after which a rival is evaluated, beside the last; within the first, off-policy learners
-take about as long as T6-GPS takes for all."""
+"""Control steps of a training after which a rival is evaluated, beside the last; off-policy learners take about as long
+for the second as T6-GPS takes for 375,000."""
 
 
 @dataclass(frozen=True, kw_only=True)
