@@ -338,6 +338,7 @@ STUDIES = {
         },
         quick=("run.episodes=4", "run.iterations=10", "run.evaluation_episodes=20"),
         quick_seeds=1,
+        figures=("along_training",),
     ),
     "transfer": Study(
         question="What do policies of the rough ground do in worlds that they never saw?",

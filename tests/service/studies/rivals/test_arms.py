@@ -11,7 +11,7 @@ import pytest
 from t6gps.service import config as configuration
 from t6gps.service import seeding
 from t6gps.service.config import Config
-from t6gps.service.studies import conduct, libraries, report
+from t6gps.service.studies import arm_figures, conduct, libraries, report
 from t6gps.service.studies.declared import BY_HAND, STUDIES, Arm, Baseline, Rival, Scale, Study
 from t6gps.service.studies.rivals import arms, curve, settings
 from t6gps.service.studies.watcher import Progress
@@ -36,6 +36,7 @@ GAITS = Study(
     arms={name.value: Arm(name.value, "rough ground", "rough", baseline=name) for name in (Rival.GAIT, Rival.CPG)},
     quick=("run.iterations=1", "run.episodes=6", "run.steps=250", "run.evaluation_episodes=2"),
     quick_seeds=1,
+    figures=("along_training",),
 )
 
 
@@ -105,7 +106,9 @@ def test_the_folder_of_a_study_shows_rivals_along_their_training(
     finished: tuple[Path, list[conduct.Finished]], tmp_path: Path
 ) -> None:
     files = report.write(tmp_path / "out", "gaits", GAITS, ["t6gps", "study", "gaits"], finished[1])
-    assert "curves.csv" in {file.name for file in files}
+    assert {"curves.csv", "along_training.png"} <= {file.name for file in files}
+    axes = arm_figures.along_training(finished[1]).get_axes()[0]
+    assert [line.get_xdata().tolist() for line in axes.get_lines()] == [[0], [1400]]
     page = (tmp_path / "out" / "README.md").read_text()
     assert "| cpg | 1 | 1,400 |" in page
     assert "| gait | 1 | 0 |" in page
