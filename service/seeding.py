@@ -20,6 +20,7 @@ class Branch(IntEnum):
     EVALUATION           seeds of noise-free episodes, and of their ground
     EVALUATION_TERRAIN   seeds of their ground alone, where it has a seed of its own
     BASELINES            baselines that draw random numbers (`studies.baselines`)
+    RIVALS               rivals, and what their libraries draw (`studies.rivals`)
     """
 
     TRAINING = 0
@@ -27,6 +28,7 @@ class Branch(IntEnum):
     EVALUATION = 2
     EVALUATION_TERRAIN = 3
     BASELINES = 4
+    RIVALS = 5
 
 
 QUIET = 0.2
@@ -103,6 +105,16 @@ def _plan(
 def sequence(root: int, branch: Branch, *further: int) -> np.random.SeedSequence:
     """The root of a branch, or of one of its parts, below a seed."""
     return np.random.SeedSequence(root, spawn_key=(int(branch), *further))
+
+
+def generator(root: int, branch: Branch, *further: int) -> np.random.Generator:
+    """A generator of a branch, or of one of its parts, below a seed."""
+    return np.random.default_rng(sequence(root, branch, *further))
+
+
+def number(root: int, branch: Branch, *further: int) -> int:
+    """A seed of 32 bits for a library that wants a number, of a branch or of one of its parts, below a seed."""
+    return int(sequence(root, branch, *further).generate_state(1)[0])
 
 
 def _seeds(root: int, branch: Branch, *further: int) -> tuple[int, int]:

@@ -182,6 +182,38 @@ def conditions(finished: Sequence[Finished]) -> Figure:
     return figure
 
 
+def along_training(finished: Sequence[Finished]) -> Figure:
+    """Speed of the noise-free policy over steps and over seconds of training: rivals as lines, T6-GPS as dots."""
+    arms: dict[str, list[Finished]] = {}
+    for outcome in finished:
+        arms.setdefault(outcome.trial.declared.label, []).append(outcome)
+    with rc_context(STYLE):
+        figure = canvas(12, 4.5)
+        panels = figure.subplots(1, 2, sharey=True)
+        for number, (label, runs) in enumerate(arms.items()):
+            points = np.mean([_along(outcome) for outcome in runs], axis=0)
+            marker = "o" if runs[0].curve else "*"
+            for axes, x in zip(panels, points.T, strict=False):
+                colour, dashed = COLOURS[number % len(COLOURS)], number >= len(COLOURS)
+                axes.plot(x, points[:, 2], "--" if dashed else "-", color=colour, marker=marker, label=label)
+        for axes, title in zip(panels, ("control steps", "seconds of training by the clock"), strict=True):
+            axes.set(xlabel=title, xscale="symlog")
+        panels[0].set_ylabel("speed to the waypoint (m/s)")
+        figure.legend(*axes.get_legend_handles_labels(), loc="outside right upper")
+    return figure
+
+
+def _along(outcome: Finished) -> Values:
+    """Steps, seconds of training and speed [n, 3]: of each mark of a rival, or of a finished training of T6-GPS."""
+    if outcome.curve:
+        points = [(point.steps, point.wall_s, point.evaluation) for point in outcome.curve]
+    else:
+        spent_s = sum(np.nansum(numbers(_iterations(outcome), column)) for column in SPENT)
+        points = [(outcome.trial.training_steps, float(spent_s), outcome.evaluation)]
+    return np.array([(steps, wall_s, result.forward_speed_m_per_s.mean) for steps, wall_s, result in points])
+
+
+SPENT = ("sampling_s", "segmenting_s", "fitting_s", "backward_pass_s", "supervised_s")
 CLASS_COLUMNS = ["kind", "entry_edge", "exit_edge", "segments", "pooled", "modes"]
 
 FIGURES: dict[str, Callable[[Sequence[Finished]], Figure]] = {
@@ -190,6 +222,7 @@ FIGURES: dict[str, Callable[[Sequence[Finished]], Figure]] = {
     "speed_distribution": speed_distribution,
     "modes_per_class": modes_per_class,
     "conditions": conditions,
+    "along_training": along_training,
     "ground_track": ground_figures.ground_track,
     "footprints": ground_figures.footprints,
     "climb": ground_figures.climb,

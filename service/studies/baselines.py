@@ -16,16 +16,17 @@ from numpy.typing import NDArray
 from t6gps.service import seeding
 from t6gps.service.config import Config
 from t6gps.service.seeding import Branch
+from t6gps.service.studies import controllers
 from t6gps.service.studies.declared import Baseline
 from t6gps.service.studies.watcher import Progress, Watcher
-from t6gps.service.training import evaluation, evaluation_records, origin, session
-from t6gps.service.training.evaluation import Evaluation, Judged
+from t6gps.service.training import evaluation, origin, session
+from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.evaluation_records import Occasion, Purpose
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog, checkpoint, durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.checkpoint import JSON
-from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.errors import RunError
 from t6gps.storage.records import EpisodePlan
 from t6gps.workers.episode import gaits
 from t6gps.workers.episode.rollout import Controller, controlled
@@ -74,17 +75,8 @@ def evaluate(
     config = origin.configured(run, overrides)
     nominal_m = nominal_rest_length(config.robot)
     control = gaits.flop(nominal_m) if baseline is Baseline.FLOP else gaits.waves(nominal_m, _kept_gait(run))
-    size, found = config.run, list[Judged]()
-    plans = seeding.evaluation_plans(config, size.evaluation_episodes, size.seed, None, 0)
-    with PyBulletEngine(config.robot) as simulation, evaluation_records.collecting(run) as episodes:
-        for plan in plans:
-            episode = controlled(simulation, config.rollout, plan, control, 0, nominal_m)
-            found.append(evaluation.judged(episode, config))
-            episodes.append(episode)
-        result = evaluation.summarise(found, size.seed)
-        purpose = Purpose.TRAINING if condition is None else Purpose.CONDITION
-        evaluation_records.commit(run, config, result, episodes, Occasion(purpose, condition), 0)
-    return result
+    purpose = Purpose.TRAINING if condition is None else Purpose.CONDITION
+    return controllers.evaluate(run, config, control, Occasion(purpose, condition))
 
 
 def _keep_gait(run: Run, parameters: Array) -> None:
@@ -105,7 +97,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
     generations = steps // (OFFSPRING_N * EVOLUTION_STEPS)
     if not generations:
         raise RunError(f"{steps} steps make up no generation of {OFFSPRING_N} x {EVOLUTION_STEPS}; allow more steps")
-    rng = np.random.default_rng(seeding.sequence(config.run.seed, Branch.BASELINES))
+    rng = seeding.generator(config.run.seed, Branch.BASELINES)
     settings = config.rollout
     terrain = settings.terrain.model_copy(update={"difficulty": 0.0, "tilt_deg": 0.0, "file": None})
     settings = settings.model_copy(
@@ -134,7 +126,7 @@ def evolve(config: Config, steps: int, progress: Progress) -> Array:
 
 
 def train_ppo(config: Config, steps: int, progress: Progress) -> PPO:
-    """The PPO model that `steps` steps of the Gymnasium environment make. ConfigError without stable-baselines3."""
+    """The PPO model that `steps` steps of the Gymnasium environment make."""
     import torch
 
     torch.set_num_threads(1)
@@ -152,13 +144,8 @@ def train_ppo(config: Config, steps: int, progress: Progress) -> PPO:
 
 def new_ppo(config: Config) -> PPO:
     """An untrained PPO model whose actor is a tanh network with the layers of the policy of T6-GPS."""
-    try:
-        from stable_baselines3 import PPO
-    except ModuleNotFoundError as error:
-        raise ConfigError(
-            "PPO needs stable-baselines3, which is not installed; run: pip install 't6gps[baselines]'"
-        ) from error
     from gymnasium.wrappers import TimeLimit
+    from stable_baselines3 import PPO
     from torch.nn import Tanh
 
     from t6gps.workers.environment import SuperBallEnvironment

@@ -15,9 +15,12 @@ from pathlib import Path
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
 from t6gps.service.provenance import commit
-from t6gps.service.studies import baselines
-from t6gps.service.studies.declared import PAPER, PAPER_SEEDS, Arm, Baseline, Scale, Study
+from t6gps.service.studies import baselines, libraries
+from t6gps.service.studies.declared import BY_HAND, PAPER, PAPER_SEEDS, Arm, Baseline, Rival, Scale, Study
 from t6gps.service.studies.origin import Origin, origin, recorded
+from t6gps.service.studies.rivals import arms as rivals
+from t6gps.service.studies.rivals import curve
+from t6gps.service.studies.rivals.curve import Point
 from t6gps.service.studies.watcher import Watcher
 from t6gps.service.training import evaluation, session
 from t6gps.service.training import origin as run_origin
@@ -28,8 +31,12 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
 
 SECONDS_PER_STEP = {True: 0.0005, False: 0.0003}
+LEARNING_SECONDS_PER_STEP: dict[Baseline | Rival | None, float] = {
+    rival: 0.01 for rival in Rival if rival.startswith(("sac", "tqc", "crossq"))
+}
 SECONDS_PER_RUN, SECONDS_PER_CONDITION = 10.0, 5.0
-"""Of two idle cores, on rough and on flat ground, learning included; to start and to draw (for the estimate alone)."""
+"""Of two idle cores, on rough and on flat ground, learning included; what an off-policy rival takes beside;
+to start and to draw (for the estimate alone)."""
 
 
 @dataclass(frozen=True)
@@ -52,18 +59,22 @@ class Trial:
     def training_steps(self) -> int:
         """Control steps that it learns from, I x N x T; none for a gait made by hand."""
         size = self.config.run
-        return 0 if self.declared.baseline is Baseline.FLOP else size.iterations * size.episodes * size.steps
+        return 0 if self.declared.baseline in BY_HAND else size.iterations * size.episodes * size.steps
 
 
 @dataclass(frozen=True)
 class Finished:
-    """A trial with what it left: its run, the evaluation of its policy, those under other conditions, its origin."""
+    """A trial with what it left: its run, the evaluation of its policy, those under other conditions, its origin.
+
+    curve   a rival along its training, else empty
+    """
 
     trial: Trial
     run: Run
     evaluation: Evaluation
     conditions: dict[str, Evaluation]
     origin: Origin
+    curve: tuple[Point, ...] = ()
 
 
 def trials(
@@ -119,15 +130,16 @@ def conduct(
 ) -> list[Finished]:
     """Run what is missing of the trials below `root`, then evaluate each policy under `conditions` (overrides by name).
 
-    Returns the results in the order of the plan. RunError if a run of that name has another configuration, before
-    anything is sampled. Runs that another commit began are kept and said to be so; `present` is the commit at work,
-    by default the one that is checked out.
+    Returns the results in the order of the plan. RunError if a run of that name has another configuration, ConfigError
+    if an arm lacks a library, both before anything is sampled. Runs that another commit began are kept and said to be
+    so; `present` is the commit at work, by default the one that is checked out.
     """
     present = present or commit()
     catalog.folder(root)
     runs = _begun(planned, root)
     _warn_of_other_commits(list(runs.values()), present, watcher)
     missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]
+    libraries.check_installed({trial.arm: trial.declared.baseline for trial in missing})
     unseen = [
         (trial, condition)
         for trial in planned
@@ -171,8 +183,12 @@ def _begun(planned: Sequence[Trial], root: Path) -> dict[str, Run]:
 
 def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
     """Train, evaluate and draw what is missing of a trial."""
-    if trial.declared.baseline is not None:
-        baselines.complete(trial.declared.baseline, trial.config, run, watcher)
+    baseline = trial.declared.baseline
+    if isinstance(baseline, Rival):
+        rivals.complete(baseline, trial.config, run, watcher)
+        return
+    if baseline is not None:
+        baselines.complete(baseline, trial.config, run, watcher)
         return
     with watcher.run(trial.config.run.iterations) as observer:
         session.complete(trial.config, run, serial, observer)
@@ -184,7 +200,7 @@ def _evaluated(
 ) -> Evaluation:
     """The evaluation of a trial's policy in the world that the overrides of a condition change."""
     with watcher.run(trial.config.run.iterations) as observer:
-        if trial.declared.baseline is not None:
+        if isinstance(trial.declared.baseline, Baseline):
             return baselines.evaluate(trial.declared.baseline, run, overrides, serial, observer, condition)
         return session.evaluate_newest(run, overrides, serial, observer, condition)
 
@@ -196,7 +212,7 @@ def _finished(root: Path, trial: Trial, conditions: Iterable[str]) -> Finished:
     known = {condition: result for condition, result in results.items() if result is not None}
     if as_trained is None or len(known) < len(results):
         raise RunError(f"run {trial.name} lost an evaluation while the study was running; run the study again")
-    return Finished(trial, run, as_trained, known, origin(run))
+    return Finished(trial, run, as_trained, known, origin(run), tuple(curve.kept(run)))
 
 
 def _warn_of_other_commits(runs: Sequence[Run], present: str, watcher: Watcher) -> None:
@@ -230,6 +246,7 @@ def estimate_s(planned: Sequence[Trial], conditions_n: int) -> float:
     for trial in planned:
         step_s = SECONDS_PER_STEP[trial.config.terrain.difficulty > 0]
         evaluation_s = SECONDS_PER_CONDITION + trial.evaluation_steps * step_s
+        total_s += LEARNING_SECONDS_PER_STEP.get(trial.declared.baseline, 0.0) * trial.training_steps
         total_s += SECONDS_PER_RUN + (trial.training_steps + trial.evaluation_steps) * step_s
         total_s += conditions_n * evaluation_s
     return total_s

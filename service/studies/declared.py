@@ -28,6 +28,26 @@ class Baseline(StrEnum):
     PPO = "ppo"
 
 
+class Rival(StrEnum):
+    """What else may stand there, on rough ground (`rivals`); the name of a learner ends with what it commands."""
+
+    GAIT = "gait"
+    CPG = "cpg"
+    CMA_ES = "cma-es"
+    PPO_ABSOLUTE = "ppo-absolute"
+    PPO_RATES = "ppo-rates"
+    SAC_ABSOLUTE = "sac-absolute"
+    SAC_RATES = "sac-rates"
+    TQC_ABSOLUTE = "tqc-absolute"
+    TQC_RATES = "tqc-rates"
+    CROSSQ_ABSOLUTE = "crossq-absolute"
+    CROSSQ_RATES = "crossq-rates"
+
+
+BY_HAND = (Baseline.FLOP, Rival.GAIT)
+"""These learn nothing."""
+
+
 @dataclass(frozen=True)
 class Arm:
     """One of the things compared.
@@ -41,7 +61,7 @@ class Arm:
     panel: str
     preset: str
     overrides: tuple[str, ...] = ()
-    baseline: Baseline | None = None
+    baseline: Baseline | Rival | None = None
     sizes: Mapping[Scale, tuple[str, ...]] = field(default_factory=dict)
 
 
@@ -107,6 +127,8 @@ ROUGH_SIZES = {Scale.QUICK: ("run.iterations=10",), Scale.PAPER: ("run.iteration
 ROUGH = Arm("T6-GPS", "rough ground", "rough", sizes=ROUGH_SIZES)
 """The headline run."""
 
+RIVALS_EVALUATION = "run.evaluation_episodes=80"
+RIVALS_SIZE = ("run.iterations=15", "run.episodes=100", RIVALS_EVALUATION)
 STATES = ("com", "lower-nodes", "nodes", "nodes+vels", "nodes+cables")
 REDUCED_STATES = {state: (f"learner.reduced_state={state}",) for state in STATES}
 HORIZONS = {f"{steps} steps": (f"learner.horizon_steps={steps}",) for steps in (5, 10, 15, 20)}
@@ -294,6 +316,31 @@ STUDIES = {
         quick_seeds=3,
         figures=("conditions",),
         conditions={"one-way": ("task.directions=1", "run.evaluation_episodes=2")},
+    ),
+    "rivals": Study(
+        question=(
+            "What do off-policy learners, PPO, a pattern generator and evolution reach on rough ground with the same "
+            "steps, and in what time? Each rival is evaluated several times along one training."
+        ),
+        arms={
+            "t6gps": Arm("T6-GPS", "rough ground", "rough", sizes={Scale.PAPER: RIVALS_SIZE}),
+            **{
+                rival.value: Arm(rival.value, "rough ground", "rough", baseline=rival, sizes={Scale.PAPER: RIVALS_SIZE})
+                for rival in Rival
+            },
+        },
+        paper_arms={
+            f"t6gps-{steps}k": Arm(
+                f"T6-GPS, {steps},000 steps",
+                "rough ground",
+                "rough",
+                ("run.iterations=10", f"run.episodes={episodes}", RIVALS_EVALUATION),
+            )
+            for steps, episodes in ((75, 30), (125, 50))
+        },
+        quick=("run.episodes=4", "run.iterations=10", "run.evaluation_episodes=20"),
+        quick_seeds=1,
+        figures=("along_training",),
     ),
     "transfer": Study(
         question="What do policies of the rough ground do in worlds that they never saw?",

@@ -61,6 +61,8 @@ def write(out: Path, name: str, study: Study, command: Sequence[str], finished: 
     sheets = {"table.csv": arms, "runs.csv": run_rows(finished)}
     if learners:
         sheets["iterations.csv"] = iteration_rows(finished)
+    if any(outcome.curve for outcome in finished):
+        sheets["curves.csv"] = curve_rows(finished)
     if study.conditions:
         sheets["conditions.csv"] = condition_rows(finished)
     for file, rows in sheets.items():
@@ -116,6 +118,40 @@ def iteration_rows(finished: Sequence[Finished]) -> list[Row]:
         for outcome in finished
         for row in tables.read(outcome.run, "iterations", list(ITERATION_COLUMNS)).sort_by("iteration").to_pylist()
     ]
+
+
+def curve_rows(finished: Sequence[Finished]) -> list[Row]:
+    """One row per rival's run and mark: steps, seconds by the clock and of its thread, and the evaluation there."""
+    return [
+        {
+            "run": outcome.run.name,
+            "arm": outcome.trial.arm,
+            "seed": outcome.trial.seed,
+            "steps": point.steps,
+            "wall_s": point.wall_s,
+            "cpu_s": point.cpu_s,
+            **{name: estimate.mean for name, estimate in point.evaluation.estimates().items()},
+        }
+        for outcome in finished
+        for point in outcome.curve
+    ]
+
+
+def curve_table(finished: Sequence[Finished]) -> str:
+    """Markdown table of rivals and marks: mean +- standard deviation between seeds, and mean seconds of training."""
+    groups: dict[tuple[str, int], list[Row]] = {}
+    for row in curve_rows(finished):
+        groups.setdefault((row["arm"], row["steps"]), []).append(row)
+    lines = [
+        "| arm | seeds | steps | speed to the waypoint (m/s) | stuck: below 5 cm in 1 s (%) | training (s) |",
+        "|---|---|---|---|---|---|",
+    ]
+    for (arm, steps), rows in groups.items():
+        spread = spread_of(rows)
+        speed, stuck = _spread(spread, "forward_speed_m_per_s", 3), _spread(spread, "stuck_share_by_distance", 1, 100)
+        wall_s = np.mean([row["wall_s"] for row in rows])
+        lines.append(f"| {arm} | {len(rows)} | {steps:,} | {speed} | {stuck} | {wall_s:,.0f} |")
+    return "\n".join(lines) + "\n"
 
 
 def condition_rows(finished: Sequence[Finished]) -> list[Row]:
@@ -242,6 +278,7 @@ def _page(
             markdown(arms),
             "`table.csv` holds the same, `runs.csv` each run, `iterations.csv` the samples of each iteration.",
             "",
+            *(["Along the training:", "", curve_table(finished)] if any(each.curve for each in finished) else []),
             *(["Under other conditions:", "", condition_table(finished)] if study.conditions else []),
             *(line for picture in pictures for line in (f"![{picture.stem}]({picture.name})", "")),
             "## Runs",

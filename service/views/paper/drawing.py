@@ -82,7 +82,7 @@ def _ground_track(material: Material) -> Figure:
 
 def _snapshots(material: Material) -> Figure:
     shown, config = _stretch(material), material.config
-    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m)
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
     return snapshots(material.shown.frames, material.terrain, shown, sizes, _title(material, shown))
 
 

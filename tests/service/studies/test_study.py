@@ -54,6 +54,7 @@ PAIR = Study(
         "any_axis",
         "grades",
         "conditions",
+        "along_training",
     ),
     conditions={"tilted": ("terrain.tilt_deg=20",)},
 )
