@@ -93,7 +93,7 @@ def _compared(run: Run, table: str, checkpoint: Path, state: _State) -> list[Fau
         for row in pq.read_table(place.source(checkpoint), columns=list(_USED)).to_pylist():
             _replay(said, [(kind, values) for kind, values in row.items() if values is not None])
     except (pa.ArrowException, OSError, ValueError) as error:
-        place.answers(checkpoint)
+        place.answers(checkpoint, error)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
     else:
         what = "" if said == state else "it does not say what the commits of the log say"
