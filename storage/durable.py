@@ -45,6 +45,14 @@ def sha256(file: Path) -> str:
         return hashlib.file_digest(content, "sha256").hexdigest()
 
 
+def link(source: str | Path, target: str | Path) -> None:
+    """Give a file another name, too; a copy where the file system has no such names."""
+    try:
+        os.link(source, target)
+    except OSError:
+        shutil.copy2(source, target)
+
+
 def hidden(path: Path) -> Path:
     """The sibling of `path` that stands for it while it is not finished; readers ignore it."""
     return path.with_name(f".{path.name}{_PARTIAL}")

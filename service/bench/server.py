@@ -111,6 +111,7 @@ def measure(say: Say, seconds: float, rounds: int) -> dict[str, float | None]:
     pool_ratio                     the pool's control steps per second with clients over those without
     pool_steps_per_s               of the pool without clients
     server_cpu_ms_per_status       processor time of the server for everything that it does, by statuses
+    server_peak_mb                 the most memory that the server's process had at once
     """
     job = rough_job(os.cpu_count() or 1, 2 * rounds * (seconds + SETTLING_S))
     with opened(job.config) as (executor, spool), ExitStack() as stack:
@@ -130,7 +131,8 @@ def measure(say: Say, seconds: float, rounds: int) -> dict[str, float | None]:
 
         with suppress(Enough):
             executor.sample(job.plans, job.snapshot, keep)
-    return _figures(measured)
+        peak_mb = _peak_mb(process)
+    return {**_figures(measured), "server_peak_mb": peak_mb}
 
 
 def _figures(measured: Turns) -> dict[str, float | None]:
@@ -186,3 +188,10 @@ def _cpu_s(pid: int) -> float:
     """Processor time of a process so far (s)."""
     fields = Path(f"/proc/{pid}/stat").read_text().rpartition(")")[2].split()
     return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _peak_mb(pid: int) -> float:
+    """The most memory that a process has had at once (MB)."""
+    peak = re.search(r"VmHWM:\s+(\d+) kB", Path(f"/proc/{pid}/status").read_text())
+    assert peak is not None, "the kernel says so of every process"
+    return int(peak[1]) * 1024 / 1e6

@@ -5,7 +5,6 @@ Files are read a row group at a time. Of each row stays what other tables refer 
 
 from __future__ import annotations
 
-import json
 import re
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field
@@ -18,6 +17,7 @@ import pyarrow.compute as pc
 import pyarrow.parquet as pq
 
 from t6gps.storage import durable, schema
+from t6gps.storage.care import commits
 from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet, policies
@@ -83,16 +83,8 @@ def number_of(name: str) -> int | None:
 
 def opened(run: Run, table: str) -> Found:
     """What the log of a table says, and what is wrong with the log."""
-    found, sums = Found(table), dict[str, str]()
-    folder = run.tables / table / "_delta_log"
-    versions = {int(path.stem): path for path in folder.glob("*.json") if path.stem.isdecimal()}
-    for version in range(max(versions, default=-1) + 1):
-        path = versions.get(version, folder / f"{version:020d}.json")
-        try:
-            sums |= _sums(path)
-        except (OSError, ValueError, TypeError, KeyError) as error:
-            what = "the commit is missing" if version not in versions else f"the commit cannot be read: {error!r}"
-            found.faults.append(Fault(table, within(run, path), what, repairable=True))
+    written = commits.read(run, table)
+    found = Found(table, faults=written.faults)
     if found.faults:
         return found
     try:
@@ -106,20 +98,11 @@ def opened(run: Run, table: str) -> Found:
         wrong = str(error)
     else:
         found.committed_n = log.committed(delta)
-        found.files = [_entry(run, table, row, sums) for row in actions]
+        found.files = [_entry(run, table, row, written.sums) for row in actions]
     if wrong is not None:
-        found.faults.append(Fault(table, within(run, folder), wrong, repairable=True))
+        where = within(run, written.newest or run.tables / table / "_delta_log")
+        found.faults.append(Fault(table, where, wrong, repairable=True))
     return found
-
-
-def _sums(commit: Path) -> dict[str, str]:
-    """The SHA-256 that a commit has of its file. OSError, ValueError, TypeError or KeyError for one that is damaged."""
-    content = commit.read_text(encoding="utf-8")
-    actions = [action for line in content.splitlines() for action in json.loads(line).items()]
-    if not actions:
-        raise ValueError("it is empty")
-    digest = next((values.get(log.SHA256) for kind, values in actions if kind == "commitInfo"), None)
-    return {values["path"]: digest for kind, values in actions if kind == "add" and digest is not None}
 
 
 def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, str]) -> Entry:

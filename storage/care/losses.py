@@ -15,6 +15,7 @@ from t6gps.storage.care import delta_files
 from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.care.mending import DAMAGED, set_aside
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import checkpoints
 
 AGAIN = {
     "spool": "its episode is sampled again when the run is resumed",
@@ -72,8 +73,10 @@ def _evaluations(draft: Run, first: int | None) -> list[str]:
 
 
 def _cut(draft: Run, table: str, first: int) -> None:
-    """Leave a table those files alone whose numbers are smaller."""
+    """Leave a table those files alone whose numbers are smaller. No checkpoint of its log is of these alone."""
     folder = draft.tables / table
+    for state in checkpoints.kept(folder / "_delta_log"):
+        set_aside(draft, within(draft, state))
     for commit in sorted((folder / "_delta_log").glob("*.json"), reverse=True):
         number = _number(commit)
         if number is None or number >= first:

@@ -13,9 +13,9 @@ import pyarrow as pa
 
 from t6gps.storage import durable, schema, spool
 from t6gps.storage.care import delta_files
-from t6gps.storage.care.fault import Fault
+from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.catalog import Run
-from t6gps.storage.delta import iterations, log, parquet
+from t6gps.storage.delta import checkpoints, iterations, log, parquet
 from t6gps.storage.errors import DataError, RunError
 
 DAMAGED = "damaged"
@@ -31,6 +31,15 @@ def set_aside(draft: Run, place: str) -> None:
     if path.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         path.rename(target)
+
+
+def without_checkpoints(draft: Run, faults: Iterable[Fault]) -> list[str]:
+    """Set the checkpoints of logs aside that have a damaged one, since the commits say the same; what was done."""
+    logs = {Path(fault.place).parent for fault in faults if fault.place.endswith(checkpoints.ENDING)}
+    for folder in sorted(logs):
+        for state in checkpoints.kept(draft.path / folder):
+            set_aside(draft, within(draft, state))
+    return [f"checkpoints of {folder} are set aside in {DAMAGED}/: the commits say the same" for folder in sorted(logs)]
 
 
 def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[Fault]) -> list[str]:

@@ -6,7 +6,6 @@ get their places leaves each file old or new; repairing again ends it.
 
 from __future__ import annotations
 
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -69,8 +68,10 @@ def _mended(
     run: Run, draft: Run, copy: Run | None, faults: list[Fault], verify: Callable[[Run], list[Fault]]
 ) -> list[str]:
     hidden = shutil.ignore_patterns(".*")
-    shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=_link, ignore=hidden)
-    sentences = []
+    shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=durable.link, ignore=hidden)
+    sentences = mending.without_checkpoints(draft, faults)
+    if sentences:
+        faults = verify(draft)
     if copy is not None:
         unsound = verify(copy)
         for take in (mending.from_copy, mending.tables_from_copy):
@@ -82,14 +83,6 @@ def _mended(
             faults = verify(draft)
         sentences += done
     return sentences
-
-
-def _link(source: str, target: str) -> None:
-    """The same file under another name; a copy where the file system has no such names."""
-    try:
-        os.link(source, target)
-    except OSError:
-        shutil.copy2(source, target)
 
 
 def _put_in_place(draft: Path, run: Path) -> None:

@@ -18,7 +18,7 @@ from deltalake.transaction import AddAction, CommitProperties, PostCommitHookPro
 
 from t6gps.storage import durable, schema
 from t6gps.storage.catalog import Run
-from t6gps.storage.delta import parquet
+from t6gps.storage.delta import checkpoints, parquet
 from t6gps.storage.errors import DataError
 from t6gps.storage.objects import place, store
 
@@ -114,7 +114,7 @@ def add(run: Run, table: str, number: int, stem: str, groups: Iterable[pa.Table]
     statistics = _Statistics()
     folder.mkdir(exist_ok=True)
     parquet.write(file, schema.TABLES[table], map(statistics.seen, groups))
-    _commit(run, table, file, number, statistics)
+    _commit(run, table, delta, file, number, statistics)
 
 
 def add_again(run: Run, table: str, number: int, file: Path) -> None:
@@ -122,14 +122,14 @@ def add_again(run: Run, table: str, number: int, file: Path) -> None:
     statistics = _Statistics()
     for group in parquet.groups(file, sorted(IDENTITIES.intersection(schema.TABLES[table].names))):
         statistics.seen(group)
-    _commit(run, table, file, number, statistics)
+    _commit(run, table, opened(run, table), file, number, statistics)
 
 
-def _commit(run: Run, table: str, file: Path, number: int, statistics: _Statistics) -> None:
+def _commit(run: Run, table: str, delta: DeltaTable | None, file: Path, number: int, statistics: _Statistics) -> None:
     """Make a file that is on disk part of its table, durably."""
     folder, definition = run.tables / table, Schema.from_arrow(schema.TABLES[table])
     with _writing(folder):
-        delta = opened(run, table) or DeltaTable.create(str(folder), definition)
+        delta = delta or DeltaTable.create(str(folder), definition)
         delta.create_write_transaction(
             [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
             "append",
@@ -137,14 +137,18 @@ def _commit(run: Run, table: str, file: Path, number: int, statistics: _Statisti
             commit_properties=CommitProperties(
                 custom_metadata={SHA256: durable.sha256(file)}, app_transactions=[Transaction(_APPLICATION, number)]
             ),
-            # Checkpoints of the log are not forced to disk by the library; a run's log is short enough without.
+            # The library does not force them to disk.
             post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
         )
     log = folder / "_delta_log"
-    for entry in sorted(log.glob("*.json"))[-2:]:  # the commit, and the table's creation before the first
+    entries = sorted(log.glob("*.json"))
+    for entry in entries[-2:]:  # the commit, and the table's creation before the first
         durable.sync(entry)
     for parent in (log, folder, run.tables):
         durable.sync(parent)
+    if int(entries[-1].stem) % checkpoints.EVERY_N == 0:
+        with _writing(folder):
+            checkpoints.write(folder)
 
 
 @contextmanager

@@ -204,8 +204,13 @@ def below(folder: Path) -> dict[str, int]:
     """Sizes of all files below a folder, by their paths from there."""
     if isinstance(folder, ObjectPath):
         return folder.below()
-    files = (Path(parent) / name for parent, _, names in os.walk(folder) for name in names)
-    return {file.relative_to(folder).as_posix(): file.stat().st_size for file in files if file.is_file()}
+    found = dict[str, int]()
+    for file in (Path(parent) / name for parent, _, names in os.walk(folder) for name in names):
+        with suppress(FileNotFoundError):  # it has gone meanwhile
+            status = file.stat()
+            if stat.S_ISREG(status.st_mode):
+                found[file.relative_to(folder).as_posix()] = status.st_size
+    return found
 
 
 def source(file: Path) -> str | pa.NativeFile:

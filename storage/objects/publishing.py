@@ -1,8 +1,9 @@
 """Copying a run into an object store, so that its readers see whole iterations at any moment.
 
 Objects appear one after the other, and each whole. So data go first and the entry of the log that names them after,
-`episodes` and `evaluations` last of the tables, a checkpoint's DONE last of its files. Objects that never change are
-created only where there is none; one that is there already must be the same, or it belongs to another run.
+`episodes` and `evaluations` last of the tables, a checkpoint of a log after its entries, DONE last of a learner's
+checkpoint. Objects that never change are created only where there is none; one that is there already must be the same,
+or it belongs to another run. What the run itself removes goes from the copy, too.
 
 What is left to copy follows from both logs. A copy that was cut off is continued by copying again.
 """
@@ -13,14 +14,14 @@ import hashlib
 import json
 import mmap
 import secrets
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Collection, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
 from typing import Literal
 
 from t6gps.storage import checkpoint, durable, schema
-from t6gps.storage.errors import RunError, StoreError
+from t6gps.storage.errors import CheckpointError, RunError, StoreError
 from t6gps.storage.objects import store
 from t6gps.storage.objects.place import ObjectPath, answers, below
 
@@ -30,6 +31,10 @@ OF_THE_PROCESS = ("request.json", "pool/published.json")
 """What is never copied: it is for the process that runs the run."""
 AT_WORK = ("spool", "pool", "figures", "damaged")
 """What changes while a run is at work, or can be made again."""
+GOING = ("spool/", "bundles/")
+"""What a run removes when it is of no more use."""
+OF_A_LOG = ".checkpoint.parquet"
+"""How the names of a log's checkpoints end."""
 LAST = ("episodes", "evaluations")
 """Tables whose readers expect all others."""
 Progress = Callable[[int, int], object]
@@ -98,12 +103,15 @@ def publish(
     """
     there = target.below()
     _check_same(run, target, there)
-    steps = _steps(run, there, (*OF_THE_PROCESS, *without))
+    states = _states(run, target, there)
+    there = _removed(target, there, [file for file in there if file.startswith(states)])
+    gone = [file for file in there if _may_go(file) and not (run / file).exists()]
+    steps = _steps(run, there, states, (*OF_THE_PROCESS, *without))
     for done, step in enumerate(steps):
         progress(done, len(steps))
         _copy(run, target, step, there)
     progress(len(steps), len(steps))
-    _forget_states(run, target, there)
+    _removed(target, there, [*gone, *_old_states(run, there)])
 
 
 def fetch(source: ObjectPath, folder: Path, progress: Progress) -> None:
@@ -129,7 +137,7 @@ def iterations(run: Path) -> int:
 def _check_same(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
     another = RunError(f"{target} holds another run of that name; choose another name or prefix")
     fixed = [file for file in there if file.startswith(FIXED)]
-    entries = sorted(file for file in there if "/_delta_log/" in file)
+    entries = sorted(file for file in there if "/_delta_log/" in file and file.endswith(".json"))
     newest = {PurePosixPath(file).parent: file for file in entries}.values()
     here = below(run)
     told = [file for file in fixed if not file.startswith("ground/")]  # whose SHA-256 is in origin.json
@@ -146,22 +154,46 @@ def _same(run: Path, target: ObjectPath, file: str) -> bool:
     return (run / file).read_bytes() == (target / file).read_bytes()
 
 
-def _steps(run: Path, there: Mapping[str, int], without: tuple[str, ...]) -> list[_Step]:
+def _states(run: Path, target: ObjectPath, there: Mapping[str, int]) -> tuple[str, ...]:
+    """The learner's checkpoints that are left to copy, as folders: those that are sound, and not there as they are."""
+    kept = (f"checkpoints/{path.name}/" for path in checkpoint.kept(run / "checkpoints").values())
+    return tuple(state for state in kept if not _is_copied(run, target, state, there) and _is_sound(run / state))
+
+
+def _is_copied(run: Path, target: ObjectPath, state: str, there: Mapping[str, int]) -> bool:
+    """True where a checkpoint is there: DONE has the SHA-256 of the manifest, and that one those of the arrays."""
+    sizes = {f"{state}{name}": size for name, size in below(run / state).items()}
+    try:
+        return sizes.items() <= there.items() and _same(run, target, f"{state}DONE")
+    except FileNotFoundError:
+        return False  # it has gone meanwhile, here or there
+
+
+def _is_sound(state: Path) -> bool:
+    """False for a checkpoint that is torn, which is of no use in a copy, and for one that has gone meanwhile."""
+    try:
+        checkpoint.load(state)
+    except CheckpointError:
+        return False
+    return True
+
+
+def _steps(run: Path, there: Mapping[str, int], states: tuple[str, ...], without: tuple[str, ...]) -> list[_Step]:
     """What is left to copy, in order.
 
     What is written later is looked at earlier: a checkpoint and an evaluation's file before the tables that they
     follow, `episodes` before the tables that it follows. So nothing is copied without what it refers to.
     """
-    states = [f"checkpoints/{path.name}" for path in checkpoint.kept(run / "checkpoints").values()]
     others = [_Step(file, created=False) for file in _others(run, without)]
     looked = [_commits(run, table, there) for table in sorted(schema.TABLES, key=lambda table: table not in LAST)]
     commits = sorted(commit for commits in looked for commit in commits)
     steps = [_Step(file) for file in _files(run) if file.startswith(FIXED) and file not in there]
     steps += [_Step(file) for commit in commits for file in commit.files]
+    entries = {*there, *(step.file for step in steps)}
+    steps += [_Step(file, created=False) for file in _log_checkpoints(run, there, entries)]
     steps += others
-    for state in (state for state in states if f"{state}/DONE" not in there):
-        files = (_Step(f"{state}/{name}", created=False) for name in ("arrays.npz", "manifest.json"))
-        steps += [*files, _Step(f"{state}/DONE")]
+    for state in states:
+        steps += [_Step(f"{state}{name}") for name in ("arrays.npz", "manifest.json", "DONE")]
     return steps
 
 
@@ -177,6 +209,13 @@ def _commit(table: str, file: str, entry: Path) -> _Commit:
     number = next((action["txn"]["version"] for action in actions if "txn" in action), -1)
     data = (f"tables/{table}/{action['add']['path']}" for action in actions if "add" in action)
     return _Commit(table in schema.OF_EVALUATIONS, number, table in LAST, (*data, file))
+
+
+def _log_checkpoints(run: Path, there: Mapping[str, int], entries: Collection[str]) -> list[str]:
+    """The checkpoints of logs that are left to copy, of those whose entries the copy has by then."""
+    sizes = {f"tables/{file}": size for file, size in below(run / "tables").items() if file.endswith(OF_A_LOG)}
+    whole = (file for file in sizes if f"{file.removesuffix(OF_A_LOG)}.json" in entries)
+    return [file for file in whole if there.get(file) != sizes[file]]
 
 
 def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:
@@ -233,13 +272,23 @@ def _sha256(content: bytes | mmap.mmap) -> str:
     return hashlib.sha256(content).hexdigest()
 
 
-def _forget_states(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
-    """Remove the checkpoints that the run itself has removed by now, their DONE first, once a later one is there."""
-    import obstore
+def _may_go(file: str) -> bool:
+    """True for what a run removes, or a repair sets aside, with nothing lost."""
+    return file.startswith(GOING) or file.endswith(OF_A_LOG)
 
+
+def _old_states(run: Path, there: Mapping[str, int]) -> list[str]:
+    """Files of the checkpoints that the run itself has removed by now, once a later one is there."""
     folders = (f"checkpoints/{path.name}/" for path in checkpoint.kept(run / "checkpoints").values())
     first = min((folder for folder in folders if f"{folder}DONE" in there), default="")  # or else all would be gone
-    old = sorted(file for file in there if file.startswith("checkpoints/") and file < first)
+    return [file for file in there if file.startswith("checkpoints/") and file < first]
+
+
+def _removed(target: ObjectPath, there: dict[str, int], files: list[str]) -> dict[str, int]:
+    """Remove objects, a checkpoint's DONE before its other files; those that are left."""
+    import obstore
+
     with store.asking(target.bucket, str(target)):
-        for file in old:
+        for file in sorted(files):
             obstore.delete(target.client(), (target / file).key)
+    return {file: size for file, size in there.items() if file not in files}

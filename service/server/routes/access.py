@@ -192,11 +192,12 @@ def training(place: Served, name: str) -> Job | None:
     return records.training(place.root, name)
 
 
-def _named(place: Place, name: Name) -> Run:
+def named(place: Place, name: Name) -> Run:
+    """The run of that name. NoSuchRunError where there is none."""
     try:
         return catalog.open_run(place.root, name)
     except RunError as error:
         raise NoSuchRunError(*error.args) from None
 
 
-NamedRun = Annotated[Run, Depends(_named)]
+NamedRun = Annotated[Run, Depends(named)]

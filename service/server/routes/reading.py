@@ -7,13 +7,14 @@ from typing import Annotated
 
 from fastapi import APIRouter, Header
 from fastapi.responses import StreamingResponse
+from starlette.concurrency import run_in_threadpool
 from starlette.types import Receive, Scope, Send
 
 from t6gps.service.remote.messages import CursorText
 from t6gps.service.remote.stream import START
 from t6gps.service.server import updates
 from t6gps.service.server.feed import Cursor
-from t6gps.service.server.routes.access import REFUSALS, NamedRun, Place, Reading, Slots, contents
+from t6gps.service.server.routes.access import REFUSALS, Name, NamedRun, Place, Reading, Slots, contents, named
 from t6gps.service.steering import events as happened
 from t6gps.service.steering import status as statuses
 from t6gps.service.steering.events import Event
@@ -33,9 +34,9 @@ def runs(place: Place) -> list[RunSummary]:
 
 
 @routes.get("/{name}/status")
-def status(run: NamedRun) -> Status:
+async def status(name: Name, place: Place) -> Status:  # async: many ask often, and a call in a thread is half the cost
     """How a run is: its workers, what is under way, who waits for whom and since when."""
-    return statuses.status(run)
+    return await run_in_threadpool(lambda: statuses.status(named(place, name)))
 
 
 @routes.get("/{name}/metrics")

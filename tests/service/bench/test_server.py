@@ -21,6 +21,7 @@ def test_a_server_with_slow_and_dead_clients_is_measured_beside_a_pool(ray_head:
         "pool_ratio",
         "pool_steps_per_s",
         "server_cpu_ms_per_status",
+        "server_peak_mb",
     }
     assert all(value is not None and value > 0 for value in figures.values())
 

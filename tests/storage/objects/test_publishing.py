@@ -9,16 +9,20 @@ import object_stores
 import obstore
 import pytest
 import synthetic
+from damages import flip
 from run_digest import digests
 
 from t6gps.service.api import asking
 from t6gps.service.config import load
 from t6gps.service.training import copying, origin, verification
-from t6gps.storage import catalog, checkpoint, tables
+from t6gps.storage import catalog, checkpoint, schema, tables
+from t6gps.storage.care import delta_files
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import checkpoints
 from t6gps.storage.errors import DataError, RunError, StoreError, StoreUnreachableError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
+from t6gps.storage.spool import Spool
 from t6gps.storage.sql.query import query
 from t6gps.workers.ground import ground
 
@@ -82,6 +86,66 @@ def test_checkpoints_that_the_run_has_removed_go(objects: ObjectPath, tmp_path: 
     copies = objects / run.name / "checkpoints"
     assert copies.below() == place.below(run.checkpoints)
     assert checkpoint.load(copies / "iteration-000007")[0] == 7
+
+
+def test_what_the_run_has_removed_goes_and_what_belongs_to_others_stays(objects: ObjectPath, tmp_path: Path) -> None:
+    run, copied = synthetic.made(tmp_path, 1), objects / "rolling"
+    for episode in synthetic.episodes(1):
+        Spool(run.spool, 1).append(episode)
+    bundle = run.path / "bundles" / "episode-000000000003.json"
+    bundle.parent.mkdir()
+    bundle.write_text("{}")
+    publishing.publish(run.path, copied)
+    obstore.put(copied.client(), (copied / "notes.txt").key, b"mine")
+    assert any(file.startswith("spool/") for file in copied.below())
+    synthetic.commit(run, 1)
+    Spool(run.spool, 1).clear()
+    bundle.unlink()
+    publishing.publish(run.path, copied, publishing.AT_WORK)
+    assert not [file for file in copied.below() if file.startswith(("spool/", "bundles/"))]
+    assert tables.committed_iterations(Run(copied)) == 2
+    assert (copied / "notes.txt").read_bytes() == b"mine"
+
+
+def test_a_torn_checkpoint_is_not_copied_and_one_that_was_is_replaced(objects: ObjectPath, tmp_path: Path) -> None:
+    run, copied = synthetic.made(tmp_path, 2), objects / "rolling"
+    newest = run.checkpoints / "iteration-000002"
+    flip(newest / "arrays.npz", 40)
+    publishing.publish(run.path, copied)
+    assert list(checkpoint.kept(copied / "checkpoints")) == [1]
+    checkpoint.save(run.checkpoints, 2, {"ledger": {}}, {"weights": np.zeros(9)})
+    publishing.publish(run.path, copied)
+    checkpoint.save(run.checkpoints, 2, {"ledger": {}}, {"weights": np.ones(9)})
+    publishing.publish(run.path, copied)
+    assert checkpoint.load(copied / "checkpoints" / newest.name)[2]["weights"].tolist() == [1.0] * 9
+    copies = copied / "checkpoints" / newest.name
+    obstore.put(copies.client(), (copies / "arrays.npz").key, b"torn")
+    publishing.publish(run.path, copied)
+    assert verification.verify(Run(copied)) == []
+
+
+def test_checkpoints_of_logs_come_after_their_commits_and_go_with_them(objects: ObjectPath, tmp_path: Path) -> None:
+    run, copied = synthetic.made(tmp_path, checkpoints.EVERY_N - 1), objects / "rolling"
+    publishing.publish(run.path, copied)
+    synthetic.commit(run, checkpoints.EVERY_N - 1)
+    seen = list[int]()
+
+    def look(done: int, total: int) -> None:
+        seen.append(sum(file.endswith(checkpoints.ENDING) for file in copied.below()))
+        if seen[-1] == 1 or done == total:
+            assert tables.committed_iterations(Run(copied)) == checkpoints.EVERY_N
+
+    publishing.publish(run.path, copied, publishing.AT_WORK, look)
+    assert (seen[0], seen[-1]) == (0, len(schema.OF_ITERATIONS))
+    assert verification.verify(Run(copied)) == []
+    copy = checkpoints.kept(copied / "tables" / "frames" / "_delta_log")[0]
+    obstore.put(copy.client(), copy.key, b"torn")
+    publishing.publish(run.path, copied)
+    assert delta_files.opened(Run(copied), "frames").faults == []
+    checkpoints.kept(run.tables / "frames" / "_delta_log")[0].unlink()
+    publishing.publish(run.path, copied)
+    assert not copy.exists()
+    assert delta_files.opened(Run(copied), "frames").faults == []
 
 
 def test_a_run_in_a_store_has_its_ground(objects: ObjectPath, tmp_path: Path) -> None:

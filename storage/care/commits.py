@@ -1,0 +1,100 @@
+"""The log of a table as it lies on disk: commits without a gap, and checkpoints that say what these say."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import pyarrow as pa
+import pyarrow.parquet as pq
+
+from t6gps.storage.care.fault import Fault, within
+from t6gps.storage.catalog import Run
+from t6gps.storage.delta import checkpoints, log
+from t6gps.storage.objects import place
+
+_USED = {
+    "add": ("path", "size", "stats"),
+    "txn": ("appId", "version"),
+    "metaData": ("schemaString",),
+    "protocol": ("minReaderVersion", "minWriterVersion"),
+}
+"""What readers use of the actions of a commit."""
+_MANY = ("add", "txn")
+"""Actions of which a table has several, by the first that is used of them; of the others the last one holds."""
+_State = dict[tuple[str, object], tuple[object, ...]]
+
+
+@dataclass
+class Commits:
+    """What the log of a table says.
+
+    sums      SHA-256 of files by their names; commits of earlier versions have none
+    newest    the checkpoint that its readers begin with, None where there is none
+    faults    what is wrong
+    """
+
+    sums: dict[str, str] = field(default_factory=dict)
+    newest: Path | None = None
+    faults: list[Fault] = field(default_factory=list)
+
+
+def read(run: Run, table: str) -> Commits:
+    """Read the log of a table whole. StoreError where its object store does not answer."""
+    folder = run.tables / table / "_delta_log"
+    repeated = {checkpoints.version(path): path for path in checkpoints.kept(folder)}
+    found, state = Commits(newest=repeated[max(repeated)] if repeated else None), _State()
+    there = {int(path.stem): path for path in folder.glob("*.json") if path.stem.isdecimal()}
+    for version in range(max([*there, *repeated], default=-1) + 1):
+        path = there.get(version, folder / f"{version:020d}.json")
+        try:
+            actions = _actions(path)
+            found.sums |= _sums(actions)
+            _replay(state, actions)
+        except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
+            what = "the commit is missing" if version not in there else f"the commit cannot be read: {error!r}"
+            found.faults.append(Fault(table, within(run, path), what, repairable=True))
+        if version in repeated and not found.faults:
+            found.faults += _compared(run, table, repeated[version], state)
+    return found
+
+
+def _actions(commit: Path) -> list[tuple[str, Any]]:
+    """The actions of a commit by their kinds; some error for one that is damaged."""
+    content = commit.read_text(encoding="utf-8")
+    actions = [action for line in content.splitlines() for action in json.loads(line).items()]
+    if not actions:
+        raise ValueError("it is empty")
+    return actions
+
+
+def _sums(actions: Iterable[tuple[str, Any]]) -> dict[str, str]:
+    digest = next((values.get(log.SHA256) for kind, values in actions if kind == "commitInfo"), None)
+    return {values["path"]: digest for kind, values in actions if kind == "add" and digest is not None}
+
+
+def _replay(state: _State, actions: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+    """Let actions change what readers know of a table."""
+    for kind, values in actions:
+        if kind in _USED:
+            used = tuple(values.get(name) for name in _USED[kind])
+            state[kind, used[0] if kind in _MANY else None] = used
+        elif kind == "remove":
+            state.pop(("add", values["path"]), None)
+
+
+def _compared(run: Run, table: str, checkpoint: Path, state: _State) -> list[Fault]:
+    """What is wrong with a checkpoint, after whose commits a table is in this state."""
+    said = _State()
+    try:
+        for row in pq.read_table(place.source(checkpoint), columns=list(_USED)).to_pylist():
+            _replay(said, [(kind, values) for kind, values in row.items() if values is not None])
+    except (pa.ArrowException, OSError, ValueError) as error:
+        place.answers(checkpoint, error)
+        what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
+    else:
+        what = "" if said == state else "it does not say what the commits of the log say"
+    return [Fault(table, within(run, checkpoint), what, repairable=True)] if what and checkpoint.exists() else []
