@@ -9,6 +9,7 @@ import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.storage import schema
+from t6gps.storage.records import Episode
 from t6gps.workers.physics.cables import tensions
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.symmetry import CABLE_MAP
@@ -52,6 +53,12 @@ def motion(frames: pa.Table, robot: RobotSettings) -> Motion:
         commands=np.take_along_axis(actions, cable_of[: len(actions)], axis=1),
         tensions=np.array([tensions(row, robot)[0] for row in rows]),
     )
+
+
+def of_episode(episode: Episode, robot: RobotSettings) -> Motion:
+    """The motion of an episode whose robot `robot` describes, but for the stiffness that was perhaps drawn for it."""
+    drawn = {"cable_stiffness_n_per_m": episode.summary["cable_stiffness_n_per_m"][0].as_py()}
+    return motion(episode.frames, robot.model_copy(update=drawn))
 
 
 def numbers(frames: pa.Table, name: str) -> Array:
