@@ -27,7 +27,7 @@ export function open(place) {
   const follow = h("input", { type: "checkbox", checked: true, onchange: () => (note({ follow: follow.checked ? "" : "no" }), views.forEach((one) => one.view.follow(follow.checked))) });
   const output = h("output");
   const details = h("details", { ontoggle: () => (told = -1) }, h("summary", {}, "Numbers at this step"), numbers);
-  const transport = h("div", { class: "transport", role: "group", "aria-label": "Replay" }, play, button("‹ step", -1), button("step ›", 1), h("label", {}, "Speed", rate), h("label", {}, follow, "Follow"),
+  const transport = h("div", { class: "transport", role: "group", "aria-label": "Replay" }, play, button("Step back", -1), button("Step on", 1), h("label", {}, "Speed", rate), h("label", {}, follow, "Follow"),
     h("button", { type: "button", onclick: () => views.forEach((one) => one.view.look()) }, "Reset view"), output);
   let wanted = {}, loaded = [], views = [], rows = [], told = -1, asked = 0;
   const time = clock(shown, (playing) => {
