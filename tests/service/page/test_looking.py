@@ -196,6 +196,7 @@ def test_each_view_keeps_wcag(visit: Opened, scheme: str) -> None:
         for view, one in found.items()
     }
     assert not {view: told for view, told in faults.items() if told}
+    assert all(len(one.response["passes"]) > 10 for one in found.values())
 
 
 def test_a_phone_shows_the_list_then_a_run_and_the_way_back(visit: Opened) -> None:

@@ -32,7 +32,10 @@ export function open(place) {
   let wanted = {}, loaded = [], views = [], rows = [], told = -1, asked = 0;
   const time = clock(shown, (playing) => {
     fill(play, playing ? "❚❚ Pause" : "▶ Play");
-    if (!playing && loaded.length) note({ step: Math.round(time.state.time_s / step_s()) || "" });
+    if (playing || !loaded.length) return;
+    const step = Math.floor(time.state.time_s / step_s() + 1e-6); // what stands is a stored row
+    time.set(step * step_s());
+    note({ step: step || "" });
   });
   const step_s = () => (loaded[0]?.time_s.length > 1 ? loaded[0].time_s[1] : 0.1);
   time.play(false);
