@@ -33,7 +33,10 @@ def test_every_file_is_served_without_a_token_and_forbids_what_is_not_of_the_pag
             assert "unsafe" not in policy
             assert "://" not in policy
             assert answer.headers["X-Content-Type-Options"] == "nosniff"
-        assert http.get("/page/style.css").headers["Content-Type"].startswith("text/css")
+        style = http.get("/page/style.css")
+        assert style.headers["Content-Type"].startswith("text/css")
+        again = http.get("/page/style.css", headers={"If-None-Match": style.headers["ETag"]})
+        assert (again.status_code, again.content) == (304, b"")
         for path in ("/page/", "/page/none.js", "/page/../files.py", "/page/%2e%2e/files.py", "/page/vendor/README.md"):
             assert http.get(path).status_code in (401, 404), path
 
