@@ -12,6 +12,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 
+import failing_object
 from obstore.store import S3Store
 
 KEY, SECRET, BUCKET = "tests", "secret-of-tests", "bucket"
@@ -111,6 +112,18 @@ def rclone(folder: Path) -> Iterator[Store]:
     keys = [f"--auth-key={key},{SECRET}" for key in (KEY, MAKER)]
     command = [_program("rclone"), "serve", "s3", *keys, f"--addr=127.0.0.1:{port}", "data"]
     yield from _running(Store(command, folder, port))
+
+
+@contextmanager
+def failing(store: Store, path: str) -> Iterator[str]:
+    """The address of a store that is well, but for one object: whoever reads that is told of an internal error."""
+    command = [sys.executable, failing_object.__file__, str(store.port), path]
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True) as between:
+        try:
+            assert between.stdout is not None, "it is a pipe"
+            yield f"http://127.0.0.1:{int(between.stdout.readline())}"
+        finally:
+            between.kill()
 
 
 def _running(store: Store) -> Iterator[Store]:

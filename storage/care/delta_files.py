@@ -141,7 +141,7 @@ def examine(run: Run, found: Found, entry: Entry) -> None:
     try:
         keys = _keys(found.table, entry)
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
-        place.answers(entry.path)
+        place.answers(entry.path, error)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
         found.faults.append(Fault(found.table, within(run, entry.path), what, entry.number))
     else:

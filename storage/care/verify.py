@@ -104,6 +104,7 @@ def _spooled(run: Run, waiting: list[Path]) -> Iterator[Fault]:
         try:
             spool.checked(spool.read(path), int(path.parent.name.removeprefix("iteration-")))
         except (pa.ArrowException, OSError, DataError) as error:
+            place.answers(path, error)
             if path.exists():
                 what = (str(error).splitlines() or [type(error).__name__])[0]
                 yield Fault("spool", within(run, path), what, repairable=True)

@@ -165,7 +165,7 @@ def readable(run: Run, table: str) -> Iterator[None]:
     try:
         yield
     except (DeltaError, pa.ArrowException, OSError) as error:
-        place.answers(run.path)
+        place.answers(run.path, error)
         raise damaged(run, table, _reason(error)) from error
 
 

@@ -222,8 +222,13 @@ def located(paths: Iterable[str]) -> tuple[fs.FileSystem, list[str]]:
     return store.file_system(), [path.removeprefix(prefix) for path in found]
 
 
-def answers(path: Path) -> None:
-    """StoreError where a path is in an object store that does not answer, or refuses."""
+def answers(path: Path, error: Exception | None = None) -> None:
+    """StoreError where a path is in an object store that does not answer, or refuses.
+
+    Also where a library's error says that it did not answer then.
+    """
     if isinstance(path, ObjectPath):
+        if error is not None and store.away(error):
+            raise store.explained(error, path.bucket) from error
         with suppress(FileNotFoundError):
             path.stat()

@@ -32,8 +32,10 @@ CONNECT_S, READ_S, WRITE_S = 5, 30, 600
 """To reach the store, for an answer, and for an object that is sent or fetched whole: 80 MB at 1 Mbit/s."""
 RETRIES_N, RETRY_S = 2, 10
 LOOPBACK = ("127.0.0.1", "localhost", "::1")
-_CODE = re.compile(r"<Code>(\w+)</Code>")
-_STATUS = re.compile(r"status code: (\d{3})|HTTP status (\d{3})")
+_CODE = re.compile(r"<Code>(\w+)</Code>|AWS Error ((?!UNKNOWN)[A-Z_]+)")
+_STATUS = re.compile(r"status(?: code)?[\s:↳]+(\d{3})")
+_AWAY = re.compile(r"HTTP error|AWS Error (NETWORK_|REQUEST_TIMEOUT|SERVICE_UNAVAILABLE|SLOW_DOWN|INTERNAL_FAILURE)")
+_COLOUR = re.compile("\x1b\\[[0-9;]*m")
 _PREFIX = "AWS_"
 _KEYS = ("AWS_ACCESS_KEY_ID", "AWS_SECRET_ACCESS_KEY")
 
@@ -174,18 +176,25 @@ def asking(bucket: str, place: str) -> Iterator[None]:
         raise explained(error, bucket) from None
 
 
+def away(error: Exception) -> bool:
+    """True where obstore, deltalake or pyarrow says that the store does not answer, or cannot now: 429, 5xx."""
+    text = _COLOUR.sub("", str(error))
+    status = _STATUS.search(text)
+    return bool(_AWAY.search(text)) or (status is not None and (status[1] == "429" or status[1].startswith("5")))
+
+
 def explained(error: Exception, bucket: str) -> StoreError:
     """What the store has answered, or that it does not, with the remedy."""
-    text, name = str(error), access().name
+    text, name = _COLOUR.sub("", str(error)), access().name
     code, status = _CODE.search(text), _STATUS.search(text)
-    said = code[1] if code else f"status {status[1] or status[2]}" if status else None
+    said = code[1] or code[2] if code else f"status {status[1]}" if status else None
     if said == "NoSuchBucket":
         return StoreError(f"there is no bucket {bucket!r} at {name}; make it, or correct the s3:// address")
     if said in ("AccessDenied", "InvalidAccessKeyId", "SignatureDoesNotMatch", "status 401", "status 403"):
         return StoreError(
             f"{name} refuses the bucket {bucket!r}: {said}; correct {' and '.join(_KEYS)}, or let them use the bucket"
         )
-    if said is not None and not said.startswith("status 5"):
+    if said is not None and not away(error):
         return StoreError(f"{name} has answered {said} for the bucket {bucket!r}; see whether it is an S3 store")
     sentence = " ".join(text.split("\n\nDebug source", maxsplit=1)[0].split())
     reason = (said or sentence.rpartition(" - ")[2])[:300]

@@ -11,6 +11,7 @@ import pytest
 import synthetic
 from run_digest import digests
 
+from t6gps.service.api import asking
 from t6gps.service.config import load
 from t6gps.service.training import copying, origin, verification
 from t6gps.storage import catalog, checkpoint, tables
@@ -18,6 +19,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError, RunError, StoreError, StoreUnreachableError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
+from t6gps.storage.sql.query import query
 from t6gps.workers.ground import ground
 
 
@@ -190,3 +192,18 @@ def test_a_store_that_goes_away_is_no_damage_of_the_run(
         for ask in (lambda: tables.read(there, "frames"), lambda: verification.verify(there)):
             with pytest.raises(StoreUnreachableError, match=r"does not answer.*see AWS_ENDPOINT_URL and the network"):
                 ask()
+
+
+@pytest.mark.parametrize("table", ["_delta_log/00000000000000000001.json", "iteration-000000.parquet"])
+def test_an_internal_error_for_one_object_is_no_damage_of_the_run(
+    run: Run, objects: ObjectPath, seaweed: object_stores.Store, monkeypatch: pytest.MonkeyPatch, table: str
+) -> None:
+    there = copying.copy(run, objects, "rolling", quiet)
+    with object_stores.failing(seaweed, f"frames/{table}") as address:
+        monkeypatch.setenv("AWS_ENDPOINT_URL", address)
+        for ask in (lambda: tables.read(there, "frames"), lambda: verification.verify(there)):
+            with pytest.raises(StoreUnreachableError, match=r"does not answer.*(InternalError|500).*then repeat"):
+                ask()
+        with pytest.raises(StoreUnreachableError, match=r"does not answer"):
+            query(asking.of_run(there, "SELECT sum(com_x_m) FROM frames", {}))
+        assert tables.read(there, "episodes").num_rows > 0
