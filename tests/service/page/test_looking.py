@@ -129,6 +129,7 @@ def test_a_query_completes_names_is_downloaded_whole_and_leads_into_the_replay(v
     expect(sql).to_have_value("SELECT run, episode_id, step FROM frames WHERE forward_speed_m_per_s")
     sql.fill("SELECT run, episode_id, step FROM frames WHERE step = 21 AND episode_id = 5 AND run = 'tiny-1'")
     sql.press("Control+Enter")
+    expect(page.get_by_text("1 row", exact=True)).to_be_visible()
     page.get_by_label("replay episode 5 of tiny-1").click()
     expect(page.locator(".tag")).to_contain_text("tiny-1 episode 5")
     expect(page.locator("output")).to_contain_text("step 21")

@@ -66,7 +66,7 @@ export function open(place) {
   function show(found, warnings) {
     const cut = found.length > ROWS_N;
     const shown = cut ? found.slice(0, ROWS_N) : found;
-    fill(said, warnings.map(fault), h("p", { class: "count" }, cut ? `More than ${ROWS_N} rows; the first ${ROWS_N} are here, a file has all.` : `${found.length} rows`));
+    fill(said, warnings.map(fault), h("p", { class: "count" }, cut ? `More than ${ROWS_N} rows; the first ${ROWS_N} are here, a file has all.` : `${found.length} row${found.length === 1 ? "" : "s"}`));
     drawn?.close();
     drawn = plot(shown, here());
     fill(drawing, drawn.element);

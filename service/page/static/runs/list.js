@@ -48,7 +48,7 @@ export function list({ changed, told, start, signal }) {
     const wanted = shown.map((run) => row(run));
     const same = wanted.length === body.children.length && wanted.every((line, k) => line === body.children[k]);
     if (!same) fill(body, wanted); // only then: whoever has the focus in it keeps it
-    fill(count, runs.length === 0 ? "No run yet. Start one, or train with ‘t6gps train’ in this root." : shown.length === runs.length ? `${runs.length} runs` : `${shown.length} of ${runs.length} runs`,
+    fill(count, runs.length === 0 ? "No run yet. Start one, or train with ‘t6gps train’ in this root." : shown.length === runs.length ? `${runs.length} run${runs.length === 1 ? "" : "s"}` : `${shown.length} of ${runs.length} runs`,
       chosen.compare.size > 0 && h("span", {}, ` · ${chosen.compare.size} compared `, h("button", { type: "button", class: "quiet", onclick: () => choose({ compare: new Set() }) }, "Clear")));
   }
 
