@@ -51,6 +51,24 @@ def read(path: Path) -> Episode:
     return Episode(*ipc.unpack(source, 2))
 
 
+def newest(folder: Path) -> Episode | None:
+    """The episode that came last of those in a run's spool, for who only looks; None where none waits there."""
+    for path in sorted(folder.glob("iteration-*/episode-*.arrow"), key=_came, reverse=True):
+        try:
+            return read(path)
+        except FileNotFoundError:  # committed meanwhile
+            continue
+    return None
+
+
+def _came(path: Path) -> float:
+    """When a file came, -inf for one that has gone."""
+    try:
+        return path.stat().st_mtime
+    except FileNotFoundError:
+        return float("-inf")
+
+
 class Spool:
     """Episodes of one iteration that were acknowledged and are not committed yet.
 

@@ -64,9 +64,9 @@ def commit(run: Run, iteration: int, make_episode: Callable[..., Episode]) -> No
 
 
 @contextmanager
-def listening(application: object, stalled_s: float = serving.STALLED_S) -> Iterator[str]:
+def listening(application: object, stalled_s: float = serving.STALLED_S, port: int = 0) -> Iterator[str]:
     """Serve an application in a thread; its address."""
-    with serving.listening(serving.Address(port=0), stalled_s) as listener:
+    with serving.listening(serving.Address(port=port), stalled_s) as listener:
         config = uvicorn.Config(application, lifespan="off", log_level="error", timeout_graceful_shutdown=1)
         server = uvicorn.Server(config)
         thread = threading.Thread(target=server.run, args=([listener],))

@@ -42,6 +42,7 @@ from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.service.steering.status import Status
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.training.summary import Row, RunSummary
+from t6gps.service.views.replay import Replay
 from t6gps.storage import catalog, schema
 from t6gps.storage.errors import RunError
 from t6gps.storage.records import PolicySnapshot
@@ -158,11 +159,7 @@ class Client:
 
     def policy(self, name: str, version: int) -> Policy:
         """A policy that acts here."""
-        content = self.server.ask("GET", f"{_run(name)}/policies/{int(version)}")
-        try:
-            return _policy(content, version)
-        except (ValueError, KeyError, OSError) as error:
-            raise self.server.nonsense(error) from None
+        return _policy(self.server, self.server.ask("GET", f"{_run(name)}/policies/{int(version)}"), version)
 
     def query(self, runs: str, sql: str, /, **parameters: Parameter) -> pa.Table:
         """The result of one SELECT over a run, or over those that match a pattern. RunError where one is damaged."""
@@ -173,6 +170,10 @@ class Client:
     def episode(self, name: str, number: int, evaluation: int | None = None, columns: Sequence[str] = ()) -> pa.Table:
         """The frames of an episode of training, or of an evaluation, bit for bit; all columns by default."""
         return self.server.table(self.server.ask("GET", _episode(name, number, evaluation, columns)))
+
+    def replay(self, name: str, number: int | None = None, evaluation: int | None = None) -> Replay:
+        """An episode as a page draws it, without a number the newest one."""
+        return self.server.get(_replay(name, number, evaluation), Replay)
 
     def table(self, name: str, table: str) -> pa.Table:
         """A table of a run (docs/data.md)."""
@@ -203,11 +204,14 @@ class Client:
         return self.server.pieces(f"{_run(name)}/file?path={quote(path, safe='')}", offset)
 
 
-def _policy(archive: bytes, version: int) -> Policy:
-    with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
-        layers_n = sum(key.startswith("weight_") for key in arrays.files)
-        layers = tuple((arrays[f"weight_{k}"], arrays[f"bias_{k}"]) for k in range(layers_n))
-        return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
+def _policy(server: Connection, archive: bytes, version: int) -> Policy:
+    try:
+        with np.load(io.BytesIO(archive), allow_pickle=False) as arrays:
+            layers_n = sum(key.startswith("weight_") for key in arrays.files)
+            layers = tuple((arrays[f"weight_{k}"], arrays[f"bias_{k}"]) for k in range(layers_n))
+            return Policy(PolicySnapshot(version, layers, float(arrays["offset_m"]), float(arrays["scale_m"])))
+    except (ValueError, KeyError, OSError) as error:
+        raise server.nonsense(error) from None
 
 
 def question(runs: str, sql: str, form: str, parameters: Parameters) -> QueryRequest:
@@ -228,6 +232,11 @@ def _place(table: str) -> str:
 def _episode(name: str, number: int, evaluation: int | None, columns: Sequence[str]) -> str:
     of = {} if evaluation is None else {"evaluation": int(evaluation)}
     return f"{_run(name)}/episodes/{int(number)}?{urlencode({**of, 'columns': columns}, doseq=True)}"
+
+
+def _replay(name: str, number: int | None, evaluation: int | None) -> str:
+    asked = {"episode": number, "evaluation": evaluation}
+    return f"{_run(name)}/replay?{urlencode({key: int(value) for key, value in asked.items() if value is not None})}"
 
 
 def _run(name: str) -> str:

@@ -14,6 +14,7 @@ from starlette.exceptions import HTTPException
 
 from t6gps.service.monitoring import exporter
 from t6gps.service.monitoring.exporter import Exporter
+from t6gps.service.page import files as page
 from t6gps.service.remote.messages import Health
 from t6gps.service.server.guard import Clock, Guard, Limits, refusal, utc_now
 from t6gps.service.server.launching import Launch, launch
@@ -54,6 +55,7 @@ def create(
         operating.routes,
         administering.routes,
         _monitoring(root),
+        page.routes(),
     ):
         app.include_router(routes)
 

@@ -21,6 +21,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from t6gps.service.page.files import is_of_page
 from t6gps.service.remote.messages import AuditLine
 from t6gps.service.server import audit
 from t6gps.service.server.rates import Rates
@@ -28,7 +29,7 @@ from t6gps.service.server.tokens import RefusedTokenError, Token, Verifier
 from t6gps.storage.errors import ServerError
 
 OPEN = ("/v1/health", "/openapi.json")
-"""Paths that need no token: they say nothing of any run."""
+"""Paths that need no token, like those of the page: they say nothing of any run."""
 SENTENCE_LENGTH_N = 10_000
 _log = logging.getLogger(__name__)
 Clock = Callable[[], datetime]
@@ -89,7 +90,7 @@ class Guard:
         state = scope.setdefault("state", {})
         try:
             self._check_names(Headers(scope=scope))
-            if scope["path"] not in OPEN:
+            if scope["path"] not in OPEN and not is_of_page(scope["path"]):
                 state["token"] = self._check_token(scope)
             receive = _bounded(Headers(scope=scope), receive, self._limits)
             await self._app(scope, receive, self._sending(scope, send))

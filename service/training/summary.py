@@ -9,9 +9,9 @@ from typing import TypeAlias
 import pyarrow.compute as pc
 
 from t6gps.service.training import origin
-from t6gps.storage import tables
+from t6gps.storage import catalog, tables
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import StoreError, T6GpsError
+from t6gps.storage.errors import RunError, StoreError, T6GpsError
 from t6gps.storage.sql import cache
 
 Row: TypeAlias = Mapping[str, int | float | None]
@@ -22,6 +22,7 @@ class RunSummary:
     """A run in a line.
 
     planned, done   iterations; None for a run that is damaged
+    at_work         whether a process trains it; None where that cannot be known
     fault           what is damaged
     cost, forward_speed_m_per_s   of the last iteration (m2/s2, m/s)
     """
@@ -32,6 +33,7 @@ class RunSummary:
     cost: float | None = None
     forward_speed_m_per_s: float | None = None
     fault: str | None = None
+    at_work: bool | None = None
 
 
 def summary(run: Run) -> RunSummary:
@@ -41,14 +43,22 @@ def summary(run: Run) -> RunSummary:
     except StoreError:
         raise
     except T6GpsError as error:
-        return RunSummary(name=run.name, fault=str(error))
+        return RunSummary(name=run.name, fault=str(error), at_work=_at_work(run))
     return RunSummary(
         name=run.name,
         planned=planned,
         done=found.done,
         cost=found.newest.get("cost"),
         forward_speed_m_per_s=found.newest.get("forward_speed_m_per_s"),
+        at_work=_at_work(run),
     )
+
+
+def _at_work(run: Run) -> bool | None:
+    try:
+        return catalog.process_of(run) is not None
+    except RunError:  # its lock may not be read: a fact about the lock, not about its data
+        return None
 
 
 def iterations(run: Run, first: int = 0) -> list[Row]:

@@ -8,6 +8,7 @@ import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
+from t6gps.storage.records import Episode
 from t6gps.workers.physics.cables import tensions
 from t6gps.workers.robot.recorded import in_order, states
 from t6gps.workers.settings import RobotSettings
@@ -46,3 +47,9 @@ def motion(frames: pa.Table, robot: RobotSettings) -> Motion:
         commands=in_order(frames, "action"),
         tensions=tensions(state, robot)[0],
     )
+
+
+def of_episode(episode: Episode, robot: RobotSettings) -> Motion:
+    """The motion of an episode whose robot `robot` describes, but for the stiffness that was perhaps drawn for it."""
+    drawn = {"cable_stiffness_n_per_m": episode.summary["cable_stiffness_n_per_m"][0].as_py()}
+    return motion(episode.frames, robot.model_copy(update=drawn))

@@ -33,6 +33,8 @@ from t6gps.service.server.routes.access import (
 )
 from t6gps.service.training import evaluation, policies
 from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.views import replay
+from t6gps.service.views.replay import Replay
 from t6gps.storage import checkpoint, schema, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
@@ -153,6 +155,20 @@ def episode(
     with pa.ipc.new_stream(sink, frames.schema) as writer:
         writer.write_table(frames)
     return Response(sink.getvalue(), media_type=MEDIA[QueryForm.ARROW])
+
+
+@routes.get("/{name}/replay")
+def replayed(
+    run: NamedRun,
+    place: Place,
+    episode: Annotated[int | None, Query(ge=0, le=NUMBER_MOST)] = None,
+    evaluation: Annotated[int | None, Query(ge=0, le=NUMBER_MOST)] = None,
+) -> Replay:
+    """An episode as a page draws it; without a number the newest one, which perhaps waits for its iteration."""
+    if episode is None and evaluation is not None:
+        raise HTTPException(HTTPStatus.BAD_REQUEST, "an evaluation has many episodes; say which with episode=0")
+    with place.reading.taken():
+        return replay.of_newest(run) if episode is None else replay.of_stored(run, episode, evaluation)
 
 
 @routes.get("/{name}/files")

@@ -36,6 +36,7 @@ NEEDS = {
     ("GET", "/v1/runs/{name}/logs"): Scope.READ,
     ("GET", "/v1/runs/{name}/history"): Scope.READ,
     ("GET", "/v1/runs/{name}/episodes/{number}"): Scope.READ,
+    ("GET", "/v1/runs/{name}/replay"): Scope.READ,
     ("GET", "/v1/runs/{name}/files"): Scope.READ,
     ("GET", "/v1/runs/{name}/file"): Scope.READ,
     ("GET", "/v1/jobs"): Scope.READ,

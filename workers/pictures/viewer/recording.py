@@ -27,7 +27,7 @@ import rerun.blueprint as rrb
 from t6gps.storage import schema
 from t6gps.storage.records import Episode
 from t6gps.workers.pictures import scene
-from t6gps.workers.pictures.motion import Motion, motion
+from t6gps.workers.pictures.motion import Motion, of_episode
 from t6gps.workers.pictures.viewer import series, space
 from t6gps.workers.pictures.viewer.layout import ABOUT, layout
 from t6gps.workers.pictures.viewer.rows import Rows
@@ -45,8 +45,7 @@ def recorded(name: str, episode: Episode, world: World) -> bytes:
     stream = rr.RecordingStream(APPLICATION, recording_id=name, send_properties=False)
     memory = stream.memory_recording()
     summary = {key: value for key, value in episode.summary.to_pylist()[0].items() if value is not None}
-    drawn = {"cable_stiffness_n_per_m": summary["cable_stiffness_n_per_m"]}  # perhaps the episode's own
-    moved = motion(episode.frames, world.robot.model_copy(update=drawn))
+    moved = of_episode(episode, world.robot)
     stream.send_blueprint(_layout(episode.frames, moved, world))
     stream.send_recording_name(name)
     stream.send_property("episode", rr.AnyValues(**summary))

@@ -2,17 +2,14 @@
 
 from __future__ import annotations
 
-from itertools import pairwise
-
 import numpy as np
 import rerun as rr
 
 from t6gps.storage import fields, schema
-from t6gps.workers.episode.recording import STUCK_STEPS, stuck_by_distance
 from t6gps.workers.pictures.motion import Motion
+from t6gps.workers.pictures.stays import stays, stuck
 from t6gps.workers.pictures.viewer import colours
 from t6gps.workers.pictures.viewer.rows import Rows
-from t6gps.workers.robot.symmetry import EDGE_NAMES
 from t6gps.workers.robot.topology import CABLES, CABLES_N, KIND_NAMES
 
 IDENTITY = {"evaluation_id", "episode_id", "iteration", "policy_version", "step", "time_s"}
@@ -45,19 +42,12 @@ def log_cables(rows: Rows, moved: Motion) -> None:
 
 def log_segments(rows: Rows, moved: Motion) -> None:
     """Kind of the support triangle, class of the stay on it, and whether the robot is stuck."""
-    kind, face = schema.array(rows.frames, "kind"), schema.array(rows.frames, "face")
+    kind = schema.array(rows.frames, "kind")
     rows.log("segments/kind", rr.StateConfiguration(values=KIND_NAMES, colors=colours.KIND_COLOURS))
     rows.send_changes("segments/kind", [KIND_NAMES[k] for k in kind])
-    stays = np.r_[0, np.flatnonzero(np.diff(face)) + 1, len(face)]
-    entry, exit_ = (rows.frames[f"{way}_edge"].to_pylist() for way in ("entry", "exit"))
-    classes = [_class_name(int(kind[start]), entry[start], exit_[stop - 1]) for start, stop in pairwise(stays)]
-    rows.send("segments/class", rr.StateChange.columns(state=classes), stays[:-1])
-    held = np.r_[np.zeros(STUCK_STEPS, bool), stuck_by_distance(moved.com)][: len(face)]
+    found = list(stays(rows.frames))
+    classes = rr.StateChange.columns(state=[stay.name for stay in found])
+    rows.send("segments/class", classes, np.array([stay.start for stay in found]))
+    held = stuck(moved.com)
     rows.log("segments/stuck", rr.StateConfiguration(values=["moving", "stuck"], colors=[colours.GREY, colours.RED]))
     rows.send_changes("segments/stuck", ["stuck" if row else "moving" for row in held])
-
-
-def _class_name(kind: int, entry: int | None, exit_: int | None) -> str:
-    """The class of a segment in words."""
-    first, last = ("..." if edge is None else EDGE_NAMES[kind][edge] for edge in (entry, exit_))
-    return f"{KIND_NAMES[kind]}: {first} → {last}"

@@ -1,0 +1,90 @@
+// Episodes from above, for browsers that draw nothing in three dimensions.
+
+import { colour } from "../base/curves.js";
+import { NODES_N, heightOf, moment, nodesAt, pointAt, smoothed, waypointAt } from "./motion.js";
+
+const VIEW_M = 8;
+
+/** The same as `scene`, on a plain canvas. */
+export function flat(place, episodes, letters) {
+  const canvas = document.createElement("canvas");
+  place.prepend(canvas);
+  const paths = episodes.map(smoothed), nodes = episodes.map(() => new Float64Array(3 * NODES_N));
+  let time_s = 0, following = true, stale = true, centre = [0, 0], view_m = VIEW_M;
+  const observer = new ResizeObserver(() => (stale = true));
+  observer.observe(place);
+  const restyle = () => (stale = true);
+  window.addEventListener("themechange", restyle);
+
+  function show(now_s) {
+    time_s = now_s;
+    const points = episodes.map((episode, k) => {
+      const at = moment(episode, time_s);
+      nodesAt(episode, at, nodes[k]);
+      return pointAt(paths[k], at);
+    });
+    if (following) centre = [0, 1].map((axis) => points.reduce((sum, point) => sum + point[axis], 0) / points.length);
+    view_m = episodes.length > 1 ? 2 * VIEW_M : VIEW_M;
+    stale = true;
+  }
+
+  function render() {
+    if (!stale) return;
+    stale = false;
+    const width = (canvas.width = place.clientWidth * devicePixelRatio), height = (canvas.height = place.clientHeight * devicePixelRatio);
+    const pen = canvas.getContext("2d"), scale = Math.min(width, height) / view_m;
+    const x = (value) => width / 2 + (value - centre[0]) * scale, y = (value) => height / 2 - (value - centre[1]) * scale;
+    pen.fillStyle = colour("plane");
+    pen.fillRect(0, 0, width, height);
+    hills(pen, episodes[0], x, y, scale);
+    episodes.forEach((episode, k) => draw(pen, episode, nodes[k], moment(episode, time_s).row, colour(letters[k] === "B" ? "bar-b" : "bar-a"), x, y, scale));
+  }
+
+  show(0);
+  return {
+    show, render, look: () => show(time_s),
+    follow: (whether) => (following = whether),
+    nodes: (k) => Array.from({ length: NODES_N }, (_, node) => [...nodes[k].slice(3 * node, 3 * node + 3)]),
+    close() {
+      observer.disconnect();
+      window.removeEventListener("themechange", restyle);
+      canvas.remove();
+    },
+  };
+}
+
+function hills(pen, { ground }, x, y, scale) {
+  if (!ground) return;
+  const height = heightOf(ground), { cell_m } = ground;
+  for (let i = 0; i < ground.rows - 1; i += 1)
+    for (let j = 0; j < ground.columns - 1; j += 1) {
+      const left = ground.x_m + i * cell_m, low = ground.y_m + j * cell_m;
+      const level = Math.min(Math.max(height(left + cell_m / 2, low + cell_m / 2) / 1.6 + 0.5, 0), 1);
+      pen.fillStyle = `rgb(${Math.round(95 + 110 * level)} ${Math.round(125 + 70 * level)} ${Math.round(95 + 60 * level)})`;
+      pen.fillRect(x(left), y(low + cell_m), cell_m * scale + 1, cell_m * scale + 1);
+    }
+}
+
+function draw(pen, episode, nodes, row, shade, x, y, scale) {
+  const line = (points, style, width) => {
+    pen.strokeStyle = style;
+    pen.lineWidth = width;
+    pen.beginPath();
+    points.forEach(([px, py], k) => pen[k ? "lineTo" : "moveTo"](x(px), y(py)));
+    pen.stroke();
+  };
+  const track = [];
+  for (let k = 0; k < episode.com_m.length; k += 3) track.push([episode.com_m[k], episode.com_m[k + 1]]);
+  line(track, colour("edge"), 1);
+  line(track.slice(0, row + 1), colour("cap"), 3);
+  const mark = waypointAt(episode, row), node = (k) => [nodes[3 * k], nodes[3 * k + 1]];
+  pen.beginPath();
+  pen.arc(x(mark.x_m), y(mark.y_m), episode.waypoint_radius_m * scale, 0, 7);
+  pen.stroke();
+  pen.fillStyle = colour(["delta", "lambda"][episode.segments.find((span) => row < span.stop).kind]);
+  pen.beginPath();
+  episode.faces[episode.face[row]].forEach((k, n) => pen[n ? "lineTo" : "moveTo"](x(node(k)[0]), y(node(k)[1])));
+  pen.fill();
+  for (const [a, b] of episode.cables) line([node(a), node(b)], colour("faint-text"), 1);
+  for (const [a, b] of episode.bars) line([node(a), node(b)], shade, Math.max(2, 2 * episode.bar_radius_m * scale));
+}

@@ -1,0 +1,210 @@
+"""Laws of looking, in a browser: lists, curves, replay, queries and links show what is stored."""
+
+from __future__ import annotations
+
+import csv
+import io
+import json
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from axe_playwright_python.sync_playwright import Axe
+from loopback import Server
+from playwright.sync_api import Page, expect
+
+from t6gps.service.remote.messages import Scope
+from t6gps.storage import catalog, schema, tables
+from t6gps.workers.robot.state import RobotState
+
+Opened = Callable[..., Page]
+PHONE = {"viewport": {"width": 390, "height": 800}, "has_touch": True, "is_mobile": True}
+EPISODES = (
+    "#/query?runs=tiny-*&sql=SELECT+run%2C+iteration%2C+episode_id%2C+cost+FROM+episodes+ORDER+BY+run%2C+episode_id"
+)
+NO_WEBGL = """const original = HTMLCanvasElement.prototype.getContext;
+HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
+  return kind.startsWith("webgl") ? null : original.call(this, kind, ...more);
+};"""
+
+
+def nodes_of(server: Server, run: str, episode: int, step: int) -> np.ndarray:
+    """Where the stored frame has the ends of the bars [12, 3] (m)."""
+    frames = tables.episode(catalog.open_run(server.root, run), episode).frames.slice(step, 1)
+    positions = np.asarray(schema.array(frames, "bar_positions"), float).reshape(6, 3)
+    orientations = np.asarray(schema.array(frames, "bar_orientations"), float).reshape(6, 4)
+    rest = np.zeros((6, 3))
+    return RobotState.of(positions, orientations, rest, rest, np.zeros(24)).nodes()
+
+
+def drawn(page: Page) -> np.ndarray:
+    """Where the scene has them, by its numbers at this step."""
+    rows = page.locator("details table tbody tr")
+    expect(rows.first).to_be_visible()
+    cells = [row.split("\t") for row in rows.all_inner_texts()]
+    return np.array([[float(cell) for cell in row[1:]] for row in cells])
+
+
+def test_the_list_finds_runs_and_those_alike_make_one_curve(visit: Opened, served: Server) -> None:
+    page = visit("", Scope.READ)
+    rows = page.locator(".rows tbody tr")
+    expect(rows).to_have_count(3)
+    page.get_by_label("Find").fill("TINY")
+    expect(rows).to_have_count(2)
+    page.get_by_label("compare tiny-0").check()
+    page.get_by_label("compare tiny-1").check()
+    expect(page.get_by_role("heading", name="2 runs compared")).to_be_visible()
+    expect(page.get_by_role("cell", name="tiny (2 seeds)")).to_be_visible()
+    last = tables.read(catalog.open_run(served.root, "tiny-0"), "iterations", ["cost"])["cost"].to_pylist()[-1]
+    expect(page.get_by_role("img", name="tiny (2 seeds): ")).to_have_count(4)
+    expect(page.get_by_role("cell", name=f"{last:.2f}").first).to_be_visible()
+
+
+def test_a_link_to_a_run_shows_its_curves_classes_and_episodes(visit: Opened) -> None:
+    page = visit("#/runs?run=tiny-0&part=classes", Scope.READ)
+    expect(page.get_by_role("heading", name="tiny-0")).to_be_visible()
+    expect(page.get_by_role("img", name="cost: ")).to_be_visible()
+    expect(page.get_by_role("img", name="3 points").first).to_be_visible()
+    expect(page.get_by_role("tabpanel").get_by_role("row").nth(1)).to_contain_text(" → ")
+    page.get_by_role("tab", name="Classes and modes").press("ArrowRight")
+    expect(page.get_by_role("tab", name="Episodes")).to_be_focused()
+    page.get_by_label("replay episode 6", exact=True).click()
+    expect(page.locator(".tag")).to_contain_text("tiny-0 episode 6")
+    assert "run=tiny-0&episode=6" in page.url
+
+
+@pytest.mark.parametrize("script", ["", NO_WEBGL], ids=["webgl", "flat"])
+def test_the_robot_stands_where_the_stored_frame_has_it(visit: Opened, served: Server, script: str) -> None:
+    page = visit("#/replay?run=tiny-0&episode=4&step=17", Scope.READ, script)
+    expect(page.locator("output")).to_contain_text("step 17")
+    page.get_by_text("Numbers at this step").click()
+    np.testing.assert_allclose(drawn(page), nodes_of(served, "tiny-0", 4, 17), atol=1e-3)
+    page.locator(".stage").press("Shift+ArrowRight")
+    expect(page.locator("output")).to_contain_text("step 27")
+    np.testing.assert_allclose(drawn(page), nodes_of(served, "tiny-0", 4, 27), atol=1e-3)
+    expect(page.get_by_text("seen from above")).to_have_count(1 if script else 0)
+
+
+def test_two_episodes_on_one_ground_share_a_scene_and_a_clock_and_a_link_brings_them_back(visit: Opened) -> None:
+    page = visit("#/replay?run=tiny-0&episode=4", Scope.READ)
+    page.get_by_role("button", name="Another one beside it").click()
+    expect(page.locator(".tag div")).to_have_count(2)
+    expect(page.locator(".stage")).to_have_count(1)
+    page.get_by_label("Step", exact=True).fill("12")
+    page.get_by_role("button", name="Step on").click()
+    page.get_by_role("button", name="Play").click()
+    page.get_by_role("button", name="Pause").click()
+    page.wait_for_url("**step=**")
+    again = visit(page.url.partition("/#")[2].join(["#", ""]), Scope.READ)
+    expect(again.locator(".tag div")).to_have_count(2)
+    expect(again.locator("output")).to_have_text(page.locator("output").inner_text())
+
+
+def test_the_newest_episode_is_shown_and_an_unknown_one_is_said_in_place(visit: Opened) -> None:
+    page = visit("#/replay?run=tiny-0&newest=1", Scope.READ)
+    expect(page.locator(".tag")).to_contain_text("episode 8")
+    page.get_by_label("Episode", exact=True).first.fill("999")
+    page.get_by_label("Episode", exact=True).first.press("Enter")
+    expect(page.get_by_role("alert")).to_contain_text("has no episode 999")
+    expect(page.locator(".tag")).to_contain_text("episode 8")
+
+
+def test_a_query_completes_names_is_downloaded_whole_and_leads_into_the_replay(visit: Opened, served: Server) -> None:
+    page = visit(EPISODES, Scope.READ)
+    expect(page.get_by_text("18 rows")).to_be_visible()
+    expect(page.get_by_role("img", name="tiny-1: ")).to_be_visible()
+    with page.expect_download() as download:
+        page.get_by_role("button", name="csv").click()
+    found = list(csv.DictReader(io.StringIO(Path(download.value.path()).read_text())))
+    stored = tables.read(catalog.open_run(served.root, "tiny-1"), "episodes", ["episode_id", "cost"]).to_pylist()
+    costs = {(row["run"], int(row["episode_id"])): float(row["cost"]) for row in found}
+    assert costs == {(run, row["episode_id"]): row["cost"] for run in ("tiny-0", "tiny-1") for row in stored}
+    sql = page.get_by_label("SQL")
+    sql.fill("SELECT run, episode_id, step FROM frames WHERE forward_sp")
+    sql.press("End")
+    page.keyboard.type("e")
+    expect(page.get_by_role("option").first).to_contain_text("forward_speed_m_per_s")
+    page.keyboard.press("Tab")
+    expect(sql).to_have_value("SELECT run, episode_id, step FROM frames WHERE forward_speed_m_per_s")
+    sql.fill("SELECT run, episode_id, step FROM frames WHERE step = 21 AND episode_id = 5 AND run = 'tiny-1'")
+    sql.press("Control+Enter")
+    expect(page.get_by_text("1 row", exact=True)).to_be_visible()
+    page.get_by_label("replay episode 5 of tiny-1").click()
+    expect(page.locator(".tag")).to_contain_text("tiny-1 episode 5")
+    expect(page.locator("output")).to_contain_text("step 21")
+
+
+def test_wrong_sql_is_said_in_place_and_the_last_result_stays(visit: Opened) -> None:
+    page = visit(EPISODES, Scope.READ)
+    expect(page.get_by_text("18 rows")).to_be_visible()
+    page.get_by_label("SQL").fill("SELECT nothing FROM nowhere")
+    page.get_by_role("button", name="Ask").click()
+    expect(page.get_by_role("alert")).to_contain_text("nowhere")
+    expect(page.get_by_role("table", name="Result")).to_be_visible()
+    expect(page.get_by_label("SQL")).to_have_value("SELECT nothing FROM nowhere")
+
+
+def test_hundreds_of_runs_and_iterations_are_shown_and_what_is_kept_is_bounded(visit: Opened) -> None:
+    page = visit("", Scope.READ)
+    one = {"planned": 500, "done": 500, "cost": 1.0, "forward_speed_m_per_s": 0.5, "fault": None, "at_work": False}
+    runs = [{"name": f"run-{number}"} | one for number in range(500)]
+    row = {"cost": 1.0, "cost_standard_error": 0.1, "forward_speed_m_per_s": 0.5, "forward_speed_standard_error": None}
+    more = {
+        "stuck_share": 0.1,
+        "stuck_share_by_distance": None,
+        "predicted_cost_change": -0.1,
+        "realised_cost_change": None,
+    }
+    event = {"time": "2026-01-01T00:00:00Z", "event": "start", "phase": "sampling", "reason": "slot 0"}
+    told = [
+        f"event: iteration\nid: {n + 1}-0\ndata: {json.dumps({'iteration': n} | row | more)}\n\n" for n in range(500)
+    ]
+    told += [f"event: pool\nid: 500-{n + 1}\ndata: {json.dumps({'number': n} | event)}\n\n" for n in range(2000)]
+    page.route("**/v1/runs", lambda route: route.fulfill(json=runs))
+    page.route("**/events", lambda route: route.fulfill(body="".join(told), content_type="text/event-stream"))
+    expect(page.locator(".rows tbody tr")).to_have_count(500)
+    page.get_by_label("Find").fill("run-49")
+    expect(page.locator(".rows tbody tr")).to_have_count(11)
+    page.get_by_role("link", name="run-499").click()
+    expect(page.get_by_role("img", name="cost: 1 at first, 1 at last, 500 points")).to_be_visible()
+    page.get_by_role("tab", name="Events").click()
+    expect(page.get_by_text("500 events, the newest of 2000")).to_be_visible()
+
+
+@pytest.mark.parametrize("scheme", ["light", "dark"])
+def test_each_view_keeps_wcag(visit: Opened, scheme: str) -> None:
+    axe, options = Axe(), {"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]}
+    page = visit("#/runs?run=tiny-0&part=episodes", Scope.READ, color_scheme=scheme)
+    expect(page.get_by_role("heading", name="Episodes of iteration 2")).to_be_visible()
+    found = {"run": axe.run(page, options=options)}
+    page.get_by_role("tab", name="Classes and modes").click()
+    expect(page.get_by_role("tabpanel").get_by_role("row").nth(1)).to_be_visible()
+    found["classes"] = axe.run(page, options=options)
+    page.get_by_role("button", name="Start a run").click()
+    expect(page.get_by_label("Preset")).to_be_visible()
+    found["start"] = axe.run(page, options=options)
+    page.keyboard.press("Escape")
+    page.goto(page.url.partition("#")[0] + "#/replay?run=tiny-0&episode=4&run2=tiny-1&episode2=5&step=3")
+    expect(page.locator(".tag div")).to_have_count(2)
+    page.get_by_text("Numbers at this step").click()
+    found["replay"] = axe.run(page, options=options)
+    page.goto(page.url.partition("#")[0] + EPISODES)
+    expect(page.get_by_text("18 rows")).to_be_visible()
+    found["query"] = axe.run(page, options=options)
+    faults = {
+        view: [f"{v['id']}: {n['html']}" for v in one.response["violations"] for n in v["nodes"]]
+        for view, one in found.items()
+    }
+    assert not {view: told for view, told in faults.items() if told}
+    assert all(len(one.response["passes"]) > 10 for one in found.values())
+
+
+def test_a_phone_shows_the_list_then_a_run_and_the_way_back(visit: Opened) -> None:
+    page = visit("", Scope.READ, **PHONE)
+    page.get_by_role("link", name="tiny-0").tap()
+    expect(page.get_by_role("heading", name="tiny-0")).to_be_visible()
+    expect(page.locator(".list")).to_be_hidden()
+    assert page.evaluate("document.documentElement.scrollWidth <= innerWidth")
+    page.get_by_role("link", name="← all runs").tap()
+    expect(page.locator(".list")).to_be_visible()
