@@ -81,15 +81,14 @@ class Learner:
         self._carried = Carried(untrained, settings.replay_iterations, keeps_earlier)
         self._value: ActionValue | None = None
         if settings.value_from:
-            first = generator(run_seed, branch(0, Stream.ACTION_VALUE))
-            self._value = ActionValue(settings.action_value, *self._task.cost_weights, first)
+            self._value = ActionValue(settings.action_value, *task.cost_weights, self._rng(Stream.ACTION_VALUE))
         in_world = settings.localization is Localization.TIME
         self._rows: RowReading = (
             standard_gps.InWorld(task.world_labels) if in_world else Canonical(settings.reduced_state)
         )
         readings: list[Reading] = [self._rows, *([transitions.Motion(task.mirrored)] if self._value else [])]
         self._episodes = Episodes(readings, settings.longest_segment_steps)
-        self._earlier: deque[Joined] = deque(maxlen=settings.action_value.improved_iterations - 1)
+        self._earlier: deque[Joined] = deque(maxlen=settings.action_value.improved_iterations - 1 if self._value else 0)
         self.done = Done()
 
     def _rng(self, stream: Stream, round_: int = 0) -> np.random.Generator:
@@ -138,7 +137,7 @@ class Learner:
         """Fit the local models of every class (lines 4 to 6)."""
         segmented = _of(self.done.segmented, "segment")
         plans = fit_plans(self._settings, segmented, self._run_seed, self.snapshot.version)
-        if not plans:
+        if not plans or not (segmented.rows.continues & segmented.newest).any():
             raise DataError("no transition of this iteration can be learned from: every step ends in a jump")
         jobs = (local_models.job(segmented.rows, plan) for plan in plans.values())
         fits: dict[int, ClassModel] = {}
@@ -195,6 +194,7 @@ class Learner:
         """Continue from `state()`. Raises CheckpointError when entries are missing or the network has another shape."""
         self._carried.unpack(manifest, arrays, self._value)
         self._episodes.clear()
+        self._earlier.clear()
 
     def recall(self, run: Run) -> None:
         """Read from a run's tables what the next iteration depends on beside `state()`: earlier transitions."""

@@ -97,11 +97,11 @@ def kl(rows: Rows, part: Ints, action_mean: Floats, explored: Exploration) -> Fl
 def _iteration_row(results: Iteration, command_range_m: tuple[float, float]) -> Row:
     rows, improved, loss = results.segmented.rows, results.improved, results.trained.loss
     modes = np.concatenate([fit.modes[fit.modes > 0] for fit in results.fitted.fits.values()])
-    newest, segments = results.segmented.newest, results.segmented.segments
+    newest, segments, groups = results.segmented.newest, results.segmented.segments, results.segmented.groups
     sampled = np.flatnonzero(rows.continues & newest)
     return {
         "segments": int(newest[segments.start].sum()),
-        "classes": sum(not group.pooled for group in results.segmented.groups),
+        "classes": sum(not group.pooled and bool(newest[segments.start[group.segments]].any()) for group in groups),
         "modes": float(modes.mean()),
         "residual": float(np.nanmean(results.fitted.series.residual)),
         "sub_trajectories": improved.sub_trajectories,

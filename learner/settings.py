@@ -104,9 +104,15 @@ class LearnerSettings(Settings):
     @model_validator(mode="after")
     def _led_by_a_value(self) -> "LearnerSettings":
         if (self.models_share or self.rounds > 1) and not self.value_from:
-            raise ValueError("models_share and rounds need an action value; set value_from to 1 or later")
+            raise ValueError(
+                "models_share and rounds need an action value; set value_from to 1 or later, or models_share to 0 and "
+                "rounds to 1"
+            )
         if self.models_share and self.reduced_state != "nodes":
-            raise ValueError("models_share needs reduced_state = nodes, to which it adds the rest lengths")
+            raise ValueError(
+                "models_share needs reduced_state = nodes, to which it adds the rest lengths, found "
+                f"{self.reduced_state}; set models_share to 0 for another"
+            )
         return self
 
     @model_validator(mode="after")

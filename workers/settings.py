@@ -114,7 +114,7 @@ class RandomisationSettings(Settings):
     winch_speed_spread: float = Field(0.0, ge=0.0, le=0.5, description="relative spread of the winch speed")
     sensor_noise: float = Field(0.0, ge=0.0, le=1.0, description="noise on every reading (units of the observation)")
     sensor_bias: float = Field(
-        0.0, ge=0.0, le=1.0, description="standard deviation of an error of every reading that lasts an episode (same)"
+        0.0, ge=0.0, le=1.0, description="standard deviation of an error of each canonical reading in an episode (same)"
     )
     largest_delay_steps: int = Field(0, ge=0, le=10, description="largest delay of commands (control steps)")
 

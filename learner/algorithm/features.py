@@ -81,7 +81,7 @@ class Canonical:
     def rows(self, columns: Columns) -> Rows:
         """Rows of all episodes; which nodes are the lower ones depends on all of them."""
         if self.reduced_state == "lower-nodes":
-            columns["state"] = _lower_nodes(columns["state"], columns["kind"])
+            columns = columns | {"state": _lower_nodes(columns["state"], columns["kind"])}
         return rows_of(columns)
 
 

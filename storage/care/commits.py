@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Mapping
+from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,8 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import checkpoints, log
 from t6gps.storage.objects import place
 
+_Action = tuple[str, Any]
+"""An entry of a commit: its kind, and what it says."""
 _USED = {
     "add": ("path", "size", "stats"),
     "txn": ("appId", "version"),
@@ -62,7 +64,7 @@ def read(run: Run, table: str) -> Commits:
     return found
 
 
-def _actions(commit: Path) -> list[tuple[str, Any]]:
+def _actions(commit: Path) -> list[_Action]:
     """The actions of a commit by their kinds; some error for one that is damaged."""
     content = commit.read_text(encoding="utf-8")
     actions = [action for line in content.splitlines() for action in json.loads(line).items()]
@@ -71,12 +73,12 @@ def _actions(commit: Path) -> list[tuple[str, Any]]:
     return actions
 
 
-def _sums(actions: Iterable[tuple[str, Any]]) -> dict[str, str]:
+def _sums(actions: Iterable[_Action]) -> dict[str, str]:
     digest = next((values.get(log.SHA256) for kind, values in actions if kind == "commitInfo"), None)
     return {values["path"]: digest for kind, values in actions if kind == "add" and digest is not None}
 
 
-def _replay(state: _State, actions: Iterable[tuple[str, Mapping[str, Any]]]) -> None:
+def _replay(state: _State, actions: Iterable[_Action]) -> None:
     """Let actions change what readers know of a table."""
     for kind, values in actions:
         if kind in _USED:

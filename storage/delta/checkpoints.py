@@ -16,12 +16,14 @@ from t6gps.storage import durable
 
 EVERY_N = 10
 """Commits from one checkpoint to the next."""
-ENDING = ".checkpoint.parquet"
+KEPT_N = 2
+"""The newest, and one for whoever is reading."""
+ENDING, DIGITS_N = ".checkpoint.parquet", 20
 
 
 def kept(log: Path) -> list[Path]:
     """The checkpoints of a log, here or in an object store, oldest first."""
-    return sorted(path for path in log.glob(f"*{ENDING}") if path.name.removesuffix(ENDING).isdecimal())
+    return sorted(log.glob(f"{'[0-9]' * DIGITS_N}{ENDING}"))
 
 
 def version(path: Path) -> int:
@@ -47,5 +49,7 @@ def write(table: Path) -> None:
         durable.sync(made)
         made.replace(log / made.name)
         durable.sync(log)
+        for old in kept(log)[:-KEPT_N]:
+            old.unlink()
     finally:
         shutil.rmtree(draft)

@@ -1,9 +1,9 @@
 """Copying a run into an object store, so that its readers see whole iterations at any moment.
 
 Objects appear one after the other, and each whole. So data go first and the entry of the log that names them after,
-`episodes` and `evaluations` last of the tables, a checkpoint of a log after its entries, DONE last of a learner's
-checkpoint. Objects that never change are created only where there is none; one that is there already must be the same,
-or it belongs to another run. What the run itself removes goes from the copy, too.
+`episodes` and `evaluations` last of the tables, a checkpoint's DONE last of its files. Checkpoints of logs, which say
+what the entries say, are not copied. Objects that never change are created only where there is none; one that is there
+already must be the same, or it belongs to another run. What the run itself removes goes from the copy, too.
 
 What is left to copy follows from both logs. A copy that was cut off is continued by copying again.
 """
@@ -14,7 +14,7 @@ import hashlib
 import json
 import mmap
 import secrets
-from collections.abc import Callable, Collection, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path, PurePosixPath
@@ -33,8 +33,6 @@ AT_WORK = ("spool", "pool", "figures", "damaged")
 """What changes while a run is at work, or can be made again."""
 GOING = ("spool/", "bundles/")
 """What a run removes when it is of no more use."""
-OF_A_LOG = ".checkpoint.parquet"
-"""How the names of a log's checkpoints end."""
 LAST = ("episodes", "evaluations")
 """Tables whose readers expect all others."""
 Progress = Callable[[int, int], object]
@@ -105,7 +103,7 @@ def publish(
     _check_same(run, target, there)
     states = _states(run, target, there)
     there = _removed(target, there, [file for file in there if file.startswith(states)])
-    gone = [file for file in there if _may_go(file) and not (run / file).exists()]
+    gone = [file for file in there if file.startswith(GOING) and not (run / file).exists()]
     steps = _steps(run, there, states, (*OF_THE_PROCESS, *without))
     for done, step in enumerate(steps):
         progress(done, len(steps))
@@ -156,8 +154,10 @@ def _same(run: Path, target: ObjectPath, file: str) -> bool:
 
 def _states(run: Path, target: ObjectPath, there: Mapping[str, int]) -> tuple[str, ...]:
     """The learner's checkpoints that are left to copy, as folders: those that are sound, and not there as they are."""
-    kept = (f"checkpoints/{path.name}/" for path in checkpoint.kept(run / "checkpoints").values())
-    return tuple(state for state in kept if not _is_copied(run, target, state, there) and _is_sound(run / state))
+    kept = [f"checkpoints/{path.name}/" for path in checkpoint.kept(run / "checkpoints").values()]
+    left = [state for state in kept if not _is_copied(run, target, state, there)]
+    sound = [state for state in left if _is_sound(run / state)]
+    return tuple(sound if sound or len(left) < len(kept) else left)  # where none is, the copy says so as the run does
 
 
 def _is_copied(run: Path, target: ObjectPath, state: str, there: Mapping[str, int]) -> bool:
@@ -189,8 +189,6 @@ def _steps(run: Path, there: Mapping[str, int], states: tuple[str, ...], without
     commits = sorted(commit for commits in looked for commit in commits)
     steps = [_Step(file) for file in _files(run) if file.startswith(FIXED) and file not in there]
     steps += [_Step(file) for commit in commits for file in commit.files]
-    entries = {*there, *(step.file for step in steps)}
-    steps += [_Step(file, created=False) for file in _log_checkpoints(run, there, entries)]
     steps += others
     for state in states:
         steps += [_Step(f"{state}{name}") for name in ("arrays.npz", "manifest.json", "DONE")]
@@ -211,13 +209,6 @@ def _commit(table: str, file: str, entry: Path) -> _Commit:
     return _Commit(table in schema.OF_EVALUATIONS, number, table in LAST, (*data, file))
 
 
-def _log_checkpoints(run: Path, there: Mapping[str, int], entries: Collection[str]) -> list[str]:
-    """The checkpoints of logs that are left to copy, of those whose entries the copy has by then."""
-    sizes = {f"tables/{file}": size for file, size in below(run / "tables").items() if file.endswith(OF_A_LOG)}
-    whole = (file for file in sizes if f"{file.removesuffix(OF_A_LOG)}.json" in entries)
-    return [file for file in whole if there.get(file) != sizes[file]]
-
-
 def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:
     apart = (*FIXED, "tables", "checkpoints", *without)
     for file in _files(run):
@@ -227,8 +218,7 @@ def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:
 
 def _files(run: Path) -> list[str]:
     """Files by their paths in the run, without hidden ones: locks, and what is not finished."""
-    places = (path.relative_to(run) for path in sorted(run.rglob("*")) if path.is_file())
-    return [place.as_posix() for place in places if not any(part.startswith(".") for part in place.parts)]
+    return [file for file in sorted(below(run)) if not any(part.startswith(".") for part in file.split("/"))]
 
 
 def _copy(run: Path, target: ObjectPath, step: _Step, there: Mapping[str, int]) -> None:
@@ -270,11 +260,6 @@ def _content(file: Path) -> bytes | mmap.mmap:
 
 def _sha256(content: bytes | mmap.mmap) -> str:
     return hashlib.sha256(content).hexdigest()
-
-
-def _may_go(file: str) -> bool:
-    """True for what a run removes, or a repair sets aside, with nothing lost."""
-    return file.startswith(GOING) or file.endswith(OF_A_LOG)
 
 
 def _old_states(run: Path, there: Mapping[str, int]) -> list[str]:

@@ -40,7 +40,7 @@ def test_the_presets_of_the_paper_have_its_sizes() -> None:
 
 
 def test_a_kept_configuration_is_read_back_unchanged() -> None:
-    config = load("rough-quick", ["run.seed=3", "learner.reduced_state=nodes+vels"])
+    config = load("rough", ["run.seed=3", "learner.reduced_state=nodes+vels"])
     assert parse(config.to_json()) == config
 
 

@@ -47,7 +47,8 @@ def check_robot(robot: RobotSettings) -> None:
         raise PhysicsError(
             f"robot.pretension_n = {robot.pretension_n} and robot.cable_stiffness_n_per_m = "
             f"{robot.cable_stiffness_n_per_m} need rest lengths of {nominal_m:.3f} m at the neutral shape; allowed: "
-            f"commands from {robot.shortest_command_m} to {robot.longest_command_m} m; change one of the four"
+            f"commands from {robot.shortest_command_m} to {robot.longest_command_m} m; change one of them, or "
+            "robot.attachment_span_m"
         )
     with PyBulletEngine(robot) as engine:
         state = settled(engine, robot, CHECK_STEPS)

@@ -15,8 +15,7 @@ from run_digest import digests
 from t6gps.service.api import asking
 from t6gps.service.config import load
 from t6gps.service.training import copying, origin, verification
-from t6gps.storage import catalog, checkpoint, schema, tables
-from t6gps.storage.care import delta_files
+from t6gps.storage import catalog, checkpoint, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import checkpoints
 from t6gps.storage.errors import DataError, RunError, StoreError, StoreUnreachableError
@@ -124,28 +123,22 @@ def test_a_torn_checkpoint_is_not_copied_and_one_that_was_is_replaced(objects: O
     assert verification.verify(Run(copied)) == []
 
 
-def test_checkpoints_of_logs_come_after_their_commits_and_go_with_them(objects: ObjectPath, tmp_path: Path) -> None:
-    run, copied = synthetic.made(tmp_path, checkpoints.EVERY_N - 1), objects / "rolling"
+def test_a_copy_of_a_run_without_a_sound_checkpoint_says_so(objects: ObjectPath, tmp_path: Path) -> None:
+    run, copied = synthetic.made(tmp_path, 2), objects / "rolling"
+    for state in checkpoint.kept(run.checkpoints).values():
+        flip(state / "arrays.npz", 40)
     publishing.publish(run.path, copied)
-    synthetic.commit(run, checkpoints.EVERY_N - 1)
-    seen = list[int]()
+    found, there = verification.verify(run), verification.verify(Run(copied))
+    assert {fault.place for fault in found} == {fault.place for fault in there} != set()
 
-    def look(done: int, total: int) -> None:
-        seen.append(sum(file.endswith(checkpoints.ENDING) for file in copied.below()))
-        if seen[-1] == 1 or done == total:
-            assert tables.committed_iterations(Run(copied)) == checkpoints.EVERY_N
 
-    publishing.publish(run.path, copied, publishing.AT_WORK, look)
-    assert (seen[0], seen[-1]) == (0, len(schema.OF_ITERATIONS))
+def test_checkpoints_of_logs_stay_and_the_copy_is_read_by_its_commits(objects: ObjectPath, tmp_path: Path) -> None:
+    run, copied = synthetic.made(tmp_path, checkpoints.EVERY_N), objects / "rolling"
+    assert checkpoints.kept(run.tables / "frames" / "_delta_log")
+    publishing.publish(run.path, copied)
+    assert not [file for file in copied.below() if file.endswith(checkpoints.ENDING)]
+    assert tables.committed_iterations(Run(copied)) == checkpoints.EVERY_N
     assert verification.verify(Run(copied)) == []
-    copy = checkpoints.kept(copied / "tables" / "frames" / "_delta_log")[0]
-    obstore.put(copy.client(), copy.key, b"torn")
-    publishing.publish(run.path, copied)
-    assert delta_files.opened(Run(copied), "frames").faults == []
-    checkpoints.kept(run.tables / "frames" / "_delta_log")[0].unlink()
-    publishing.publish(run.path, copied)
-    assert not copy.exists()
-    assert delta_files.opened(Run(copied), "frames").faults == []
 
 
 def test_a_run_in_a_store_has_its_ground(objects: ObjectPath, tmp_path: Path) -> None:
