@@ -58,7 +58,8 @@ def test_the_build_gets_what_the_wheel_is_made_of() -> None:
     modules = [str(path.relative_to(REPOSITORY)) for room in rooms for path in (REPOSITORY / room).rglob("*.py*")]
     needed = [path for path in modules if "__pycache__" not in path] + sources
     needed += ["pyproject.toml", PROJECT["project"]["readme"], *PROJECT["project"]["license-files"]]
-    needed += [str(path.relative_to(REPOSITORY)) for path in (REPOSITORY / "deploy").glob("*/*.*")]
+    deployed = (path for path in (REPOSITORY / "deploy").glob("*/*.*") if "__pycache__" not in path.parts)
+    needed += [str(path.relative_to(REPOSITORY)) for path in deployed]
     assert not [path for path in needed if not sent(path)]
 
 

@@ -31,9 +31,12 @@ def pytest_collection_modifyitems(items: list[pytest.Item]) -> None:
             item.add_marker(needs_chromium)
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Browser]:
-    """Chromium without a window, which draws in three dimensions by the processor."""
+    """Chromium without a window, which draws in three dimensions by the processor.
+
+    While it is open, Playwright's event loop runs in the main thread, where other modules start loops of their own.
+    """
     with sync_playwright() as driver:
         arguments = ["--no-sandbox", "--use-angle=swiftshader", "--enable-unsafe-swiftshader"]
         opened = driver.chromium.launch(executable_path=CHROMIUM, args=arguments)
