@@ -5,6 +5,8 @@ VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
 SPREAD := -n auto --maxprocesses=4 --dist=loadfile
+# The soak measures the memory of its own process, in which no other test may have left holes.
+SOAK := tests/faults/test_soak.py
 ROOMS := storage workers learner service
 
 export OMP_NUM_THREADS = 1
@@ -25,7 +27,8 @@ train: install
 
 # All tests, some 25 minutes on two cores; then those that need neither Ray nor a trained run, four and a half.
 test: install
-	$(BIN)/pytest $(SPREAD)
+	$(BIN)/pytest $(SPREAD) --ignore=$(SOAK)
+	$(BIN)/pytest $(SOAK)
 
 test-fast: install
 	$(BIN)/pytest $(SPREAD) -m "not slow and not ray"
