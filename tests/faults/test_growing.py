@@ -65,8 +65,9 @@ def test_a_cluster_grows_as_the_run_asks_and_a_node_that_is_lost_again_costs_no_
                 add_node(nodes)
                 grown = True
             house.check(house.sample(lose))
-        house.check(house.sample())
+        asked = set[float]()
+        house.check(house.sample(lambda _: asked.add(asked_cpus())))
         assert used >= set(lost)
-        assert asked_cpus() == 4 * CPUS_PER_WORKER
+        assert max(asked) == 4 * CPUS_PER_WORKER  # while plans waited; between batches it asks for what it has
         house.executor.transport.close()
         assert asked_cpus() == 0
