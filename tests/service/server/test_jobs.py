@@ -105,7 +105,7 @@ def test_a_run_has_one_job_whose_end_is_told_and_leaves_no_zombie(
     assert ended is not None and ended.state is JobState.FAILED
     assert "no Ray answers" in ended.detail
     pid = int(job.native_id.split(":")[1])
-    wait_until(lambda: not Path(f"/proc/{pid}").exists(), 60)
+    wait_until(lambda: not Path(f"/proc/{pid}").exists(), 240)
 
 
 @pytest.mark.parametrize(
