@@ -24,7 +24,7 @@ from ray_nodes import HEAD, PORT, ray_start
 from slurm_cluster import wait_until
 
 PROGRAMS = ("ip", "nsenter", "unshare")
-STARTED_S, ENDED_S = 120.0, 30.0
+STARTED_S, ENDED_S = 300.0, 60.0
 CLONE_NEWNET = 0x40000000
 COMMANDS = (
     "cluster_synced_files", "rsync_exclude", "rsync_filter", "initialization_commands", "setup_commands",
@@ -146,6 +146,8 @@ def _head(cluster: RayCluster, log: int) -> Iterator[subprocess.Popen[bytes]]:
     programs = Path(sys.executable).parent
     settings = {
         "AUTOSCALER_UPDATE_INTERVAL_S": "1",
+        "RAY_health_check_initial_delay_ms": "1000",
+        "RAY_health_check_period_ms": "1000",  # a node that dies is noticed within seconds
         "PATH": f"{programs}{os.pathsep}{os.environ['PATH']}",
         "PYTHONPATH": str(Path(__file__).parent),
         "RAY_worker_niceness": "0",

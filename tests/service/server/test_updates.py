@@ -152,9 +152,9 @@ def test_a_client_that_takes_nothing_is_dropped(serve: Callable[..., Server], wa
     server = serve(stalled_s=0.5)
     (server.run.figures / "large.png").write_bytes(b"\0" * 2**25)
     slow = listener(server, "/v1/runs/walk/figures/large.png")
-    assert slow.recv(12) == b"HTTP/1.1 200"
     ports = urlsplit(server.url).port, slow.getsockname()[1]
     assert connected(*ports)
+    assert slow.recv(12) == b"HTTP/1.1 200"
     wait_until(lambda: not connected(*ports), 240)
     slow.close()
 
