@@ -4,7 +4,8 @@ PYTHON ?= python3.11
 VENV := .venv
 BIN := $(VENV)/bin
 STAMP := $(VENV)/installed
-SPREAD := -n auto --maxprocesses=4 --dist=loadfile
+# Files go out in their order, not the longest lists of tests first: clusters have few tests, which take minutes.
+SPREAD := -n auto --maxprocesses=4 --dist=loadfile --no-loadscope-reorder
 # The soak measures the memory of its own process, in which no other test may have left holes.
 SOAK := tests/faults/test_soak.py
 ROOMS := storage workers learner service
@@ -13,7 +14,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test test-fast view check bench bench-libraries fuzz soak clean
+.PHONY: install train test test-soak test-others test-fast view check bench bench-libraries fuzz soak clean
 
 install: $(STAMP)
 
@@ -27,8 +28,13 @@ train: install
 
 # All tests, some 25 minutes on two cores; then those that need neither Ray nor a trained run, four and a half.
 test: install
-	$(BIN)/pytest $(SPREAD) --ignore=$(SOAK)
+	$(MAKE) --no-print-directory --jobs=2 test-soak test-others
+
+test-soak:
 	$(BIN)/pytest $(SOAK)
+
+test-others:
+	$(BIN)/pytest $(SPREAD) --ignore=$(SOAK)
 
 test-fast: install
 	$(BIN)/pytest $(SPREAD) -m "not slow and not ray"

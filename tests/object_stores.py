@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import json
+import random
 import socket
 import subprocess
 import sys
 import time
 from collections.abc import Iterator, Sequence
-from contextlib import ExitStack, contextmanager
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -18,7 +19,10 @@ from obstore.store import S3Store
 KEY, SECRET, BUCKET = "tests", "secret-of-tests", "bucket"
 MAKER = "maker"
 """May make buckets, which a store must not do by itself."""
-READY_S = 60.0
+READY, READY_S = b"ready", 180.0
+"""What is written first, and read: a store keeps what is empty beside its volumes, which begin to serve later."""
+PORTS = range(20_000, 32_000)
+"""Linux takes the ports of connections from 32,768 on, and would give away that of a server that starts again."""
 
 
 @dataclass
@@ -58,7 +62,7 @@ class Store:
             self.process = None
 
     def _answers(self) -> bool:
-        """True when the bucket can be made, or is there."""
+        """True when the bucket can be made, or is there, and keeps what it is given."""
         keys = {"aws_access_key_id": MAKER, "aws_secret_access_key": SECRET, "aws_region": "us-east-1"}
         maker = S3Store(
             BUCKET,
@@ -67,17 +71,23 @@ class Store:
             retry_config={"max_retries": 0},
         )
         try:
-            maker.put(".ready", b"")
+            maker.put(".ready", READY)
+            return bytes(maker.get(".ready").bytes()) == READY
         except Exception:  # obstore's own have no narrower parent
             return False
-        return True
 
 
 def _ports(count: int) -> list[int]:
-    """Ports that are free now."""
+    """Ports that are free, and that no connection takes by chance."""
+    found: list[int] = []
     with ExitStack() as stack:
-        sockets = [stack.enter_context(socket.create_server(("127.0.0.1", 0))) for _ in range(count)]
-        return [each.getsockname()[1] for each in sockets]
+        for port in random.sample(PORTS, len(PORTS)):
+            with suppress(OSError):  # it is taken
+                stack.enter_context(socket.create_server(("127.0.0.1", port)))
+                found.append(port)
+            if len(found) == count:
+                break
+    return found
 
 
 def _program(name: str) -> str:

@@ -22,6 +22,7 @@ TINY = (
     "learner.epochs=2",
     "learner.replay_iterations=1",
     "learner.hidden_layers=[16]",
+    "learner.value_from=100",  # it takes longer than all else, in runs that tests make longer
 )
 """Its settings, beside those of flat-quick."""
 

@@ -9,7 +9,6 @@ from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
 
-from t6gps.service.bench.rounds import Say
 from t6gps.service.provenance import Provenance, provenance
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
@@ -58,8 +57,10 @@ class Measurement:
         return json.dumps({**asdict(self.provenance), **entries})
 
 
-def measure(name: str, say: Say, run: Callable[[], Run] | None = None, **options: float | Sequence[str]) -> Measurement:
-    """Run a benchmark, which says how far it is; `run` opens the run that it is to judge.
+def measure(
+    name: str, say: Callable[[str], None], run: Callable[[], Run] | None = None, **options: float | Sequence[str]
+) -> Measurement:
+    """Run a benchmark, which says how far it is in lines; `run` opens the run that it is to judge.
 
     ConfigError for an unknown name, for options that the benchmark has not, and for a run too many or missing.
     """

@@ -21,7 +21,7 @@ PROGRAMS = ("sbatch", "slurmctld", "slurmd", "munged", "ip", "nsenter")
 DAEMONS = ("munged", "slurmctld", "slurmd ", "slurmscriptd")
 """How the command lines of daemons begin; those that serve a step (slurmstepd) end with its job."""
 NODES = ("t6n1", "t6n2")
-STARTED_S, ENDED_S = 60.0, 60.0
+STARTED_S, ENDED_S = 180.0, 60.0
 CONFIGURATION = """\
 ClusterName=t6
 SlurmctldHost=localhost(127.0.0.1)

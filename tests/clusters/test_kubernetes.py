@@ -51,7 +51,7 @@ memory_gb_per_pod = 2
 pods = 2
 retries = 1
 """
-SOON_S, ENDS_S = 120.0, 300.0
+SOON_S = 300.0
 Wait = Callable[[Callable[[], bool], float], None]
 
 
@@ -203,6 +203,7 @@ def test_a_job_whose_rayjob_was_removed_ended_as_its_script_wrote(desk: Desk, ex
     assert not desk.cluster.pods
 
 
+@pytest.mark.slow
 def test_a_run_on_a_claim_comes_home_and_a_copy_that_was_cut_off_goes_on(desk: Desk, tmp_path: Path) -> None:
     run = ended(desk, "cut", "0")
     begun = tmp_path / "home" / ".fetched" / "cut" / "tables"

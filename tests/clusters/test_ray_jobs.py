@@ -118,7 +118,7 @@ def test_a_run_whose_root_the_head_alone_sees_gains_and_loses_nodes_and_loses_no
     assert "t6gps serve --root" in " ".join(t6gps("fetch", "far", "--to", tmp_path, code=2).stderr.split())
     assert "job far is stopped" in t6gps("stop", "far").stdout.decode()
     assert "everything sampled so far is kept" in t6gps("logs", "far").stdout.decode()
-    wait_until(lambda: not cluster.nodes(), 60.0)
+    wait_until(lambda: not cluster.nodes(), ENDS_S)
     (tmp_path / "state" / "jobs" / "far.json").unlink()
     shutil.rmtree(tmp_path / "runs")
     assert "far exists already on the cluster" in submit("far", *tiny_run.settings(), "--workers", "1", code=2)

@@ -8,7 +8,7 @@ import shutil
 import subprocess
 import sys
 import tempfile
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -18,6 +18,9 @@ import slurm_cluster
 import tiny_run
 from command import t6gps
 from slurm_cluster import Cluster, wait_until
+
+from t6gps.service.steering import requests
+from t6gps.storage import catalog, checkpoint
 
 pytestmark = [
     pytest.mark.slow,
@@ -29,8 +32,8 @@ pytestmark = [
 ]
 
 LONG = [*tiny_run.settings(), "--set=run.iterations=20"]
-"""Long enough that a job can be interrupted after its first checkpoint."""
-ENDS_S = 300.0
+"""Long enough that a job can be interrupted after a checkpoint, and again after another one."""
+ENDS_S = 600.0
 
 
 @dataclass(frozen=True)
@@ -71,10 +74,9 @@ class Desk:
     def state(self, run: str) -> str:
         return json.loads(self.t6gps("status", run, "--json").stdout)["job"]["state"]
 
-    def learned(self, run: str) -> bool:
-        """True when a run has a checkpoint."""
-        folder = self.root / run / "checkpoints"
-        return folder.is_dir() and any(folder.iterdir())
+    def learned(self, run: str) -> int:
+        """Iterations that a run's newest checkpoint holds, 0 without one."""
+        return max(checkpoint.kept(self.root / run / "checkpoints"), default=0)
 
     def ended(self, run: str) -> str:
         """Wait until a job has ended and nothing of it runs; how it ended."""
@@ -119,8 +121,8 @@ def requeue(desk: Desk, run: str) -> None:
 def fail_node(desk: Desk, run: str) -> None:
     """Set the second node down; it comes back when the job has lost it."""
     desk.cluster.asked("scontrol", "update", "nodename=t6n2", "state=down", "reason=test")
-    wait_until(lambda: not running(desk, run), 60.0)
-    wait_until(lambda: serves_again(desk), 60.0)
+    wait_until(lambda: not running(desk, run), ENDS_S)
+    wait_until(lambda: serves_again(desk), ENDS_S)
 
 
 def serves_again(desk: Desk) -> bool:
@@ -133,22 +135,34 @@ def running(desk: Desk, run: str) -> bool:
     return "RUNNING" in desk.cluster.asked("squeue", "-h", "-o", "%T", "-j", desk.number(run))
 
 
-@pytest.mark.parametrize("interrupt", [requeue, fail_node])
-def test_a_job_on_two_nodes_that_is_interrupted_resumes_to_the_same_bytes(
-    desk: Desk, expected: dict[str, str], interrupt: Callable[[Desk, str], None]
+def learns_more(desk: Desk, run: str) -> None:
+    """Wait until a run has a checkpoint that it did not have."""
+    before = desk.learned(run)
+    wait_until(lambda: desk.learned(run) > before, ENDS_S)
+
+
+def test_a_job_on_two_nodes_that_is_requeued_loses_a_node_and_is_stopped_resumes_to_the_same_bytes(
+    desk: Desk, expected: dict[str, str]
 ) -> None:
-    run = interrupt.__name__.replace("_", "-")
-    desk.submit(run, *LONG)
-    wait_until(lambda: desk.learned(run), ENDS_S)
-    interrupt(desk, run)
-    number = desk.number(run)
-    wait_until(lambda: "PENDING" in desk.cluster.asked("squeue", "-h", "-o", "%T", "-j", number), 60.0)
-    wait_until(lambda: not desk.cluster.of_jobs(), 60.0)
-    assert desk.state(run) == "pending"
-    desk.cluster.asked("scontrol", "update", f"jobid={number}", "StartTime=now")  # Slurm would wait for two minutes
-    assert desk.ended(run) == "done"
-    assert "Restarts=1" in desk.cluster.asked("scontrol", "show", "job", number)
-    assert desk.digests(run) == expected
+    desk.submit("long", *LONG)
+    number = desk.number("long")
+    for restarts_n, interrupt in enumerate((requeue, fail_node), start=1):
+        learns_more(desk, "long")
+        interrupt(desk, "long")
+        wait_until(lambda: "PENDING" in desk.cluster.asked("squeue", "-h", "-o", "%T", "-j", number), ENDS_S)
+        wait_until(lambda: not desk.cluster.of_jobs(), ENDS_S)
+        assert desk.state("long") == "pending"
+        desk.cluster.asked("scontrol", "update", f"jobid={number}", "StartTime=now")  # Slurm would wait for two minutes
+        wait_until(lambda: running(desk, "long"), ENDS_S)
+        assert f"Restarts={restarts_n}" in desk.cluster.asked("scontrol", "show", "job", number)
+    learns_more(desk, "long")
+    requests.pause(catalog.open_run(desk.root, "long"), ENDS_S)  # so that it does not end meanwhile
+    assert "job long is stopped" in desk.t6gps("stop", "long").stdout
+    assert desk.ended("long") == "stopped"
+    assert "everything sampled so far is kept" in desk.t6gps("logs", "long").stdout
+    desk.submit("long", *LONG, "--resume")
+    assert desk.ended("long") == "done"
+    assert desk.digests("long") == expected
 
 
 def test_jobs_of_an_array_share_a_node_and_each_trains_its_seed(desk: Desk) -> None:
@@ -162,17 +176,6 @@ def test_jobs_of_an_array_share_a_node_and_each_trains_its_seed(desk: Desk) -> N
     seeds = [json.loads((desk.root / run / "config.json").read_text())["run"]["seed"] for run in runs]
     assert seeds == [0, 1]
     assert all("iteration 2" in desk.t6gps("logs", run).stdout for run in runs)
-
-
-def test_a_job_stops_cleanly_and_is_resumed_by_another(desk: Desk, expected: dict[str, str]) -> None:
-    desk.submit("stopped", *LONG)
-    wait_until(lambda: desk.learned("stopped"), ENDS_S)
-    assert "job stopped is stopped" in desk.t6gps("stop", "stopped").stdout
-    assert desk.ended("stopped") == "stopped"
-    assert "everything sampled so far is kept" in desk.t6gps("logs", "stopped").stdout
-    desk.submit("stopped", *LONG, "--resume")
-    assert desk.ended("stopped") == "done"
-    assert desk.digests("stopped") == expected
 
 
 def test_a_job_that_waits_is_in_the_way_of_another_and_stops_before_it_starts(desk: Desk) -> None:

@@ -33,10 +33,10 @@ CONFIG = {"run": {"episodes": 30, "steps": 20, "workers": 2, "cpus_per_worker": 
 QUICK_HEALTH_CHECKS = {
     "RAY_health_check_initial_delay_ms": "1000",
     "RAY_health_check_period_ms": "1000",
-    "RAY_health_check_timeout_ms": "2000",
+    "RAY_health_check_timeout_ms": "5000",
     "RAY_health_check_failure_threshold": "3",
 }
-"""For a cluster's head: a node that dies or is cut off is noticed within seconds."""
+"""For a cluster's head: a node that dies is noticed within three seconds, one that is cut off or busy within twenty."""
 
 START_ATTEMPTS_N = 4
 NODE = {"include_dashboard": False, "node_ip_address": "127.0.0.1"}

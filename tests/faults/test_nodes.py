@@ -98,7 +98,7 @@ def test_t2_a_worker_that_hangs_on_another_node_is_looked_into_and_ended_there(
     ((failure,),) = house.executor.ledger.failures.values()
     assert {"SIGSTOP": "(SIGSTOP)", "hang-in-c": "_hang_in_c"}[how] in failure.trace
     assert failure.kind == {"SIGSTOP": "lost", "hang-in-c": "hang"}[how]
-    wait_until(lambda: not Path(f"/proc/{process}").exists(), 120)
+    wait_until(lambda: not Path(f"/proc/{process}").exists(), 240)
 
 
 def test_a_node_that_joins_gets_workers_when_more_are_asked_for(house: House, nodes: Cluster) -> None:

@@ -183,6 +183,7 @@ def test_learning_is_a_function_of_its_arguments_whatever_part_of_a_batch_is_don
     assert np.array_equal(other.improved(untrained()), expected)
 
 
+@pytest.mark.slow
 def test_transitions_that_are_filed_away_are_learned_from_as_those_in_memory(value: ActionValue) -> None:
     known = planted(0)
     assert isinstance(known.wide, Held) and known.filed() is known, "an iteration of this size stays in memory"

@@ -5,6 +5,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -25,6 +27,14 @@ from t6gps.workers.episode import policy as acting
 from t6gps.workers.locomotion.measures import measures
 
 TINY = tiny_run.settings()
+SLOW = {"fastapi", "matplotlib", "minari", "obstore", "ray", "rerun", "sklearn", "torch"}
+"""Modules that take a while to load."""
+
+
+def test_the_command_line_loads_nothing_slow_before_it_knows_the_command() -> None:
+    script = "import sys, t6gps.service.cli.main; print(*sys.modules)"
+    loaded = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert not SLOW & set(loaded.stdout.split())
 
 
 @pytest.fixture(scope="module")
@@ -221,7 +231,7 @@ def test_a_stopped_run_ends_within_seconds_and_resumes(
         wait_until(lambda: process.poll() is not None or len(list(tmp_path.glob(spooled))) >= 2, 240)
         assert process.poll() is None
         os.kill(process.pid, stop)
-        _, message = process.communicate(timeout=60)  # it takes a second or two where nothing else runs
+        _, message = process.communicate(timeout=240)  # it takes a second or two where nothing else runs
     finally:
         process.kill()
     assert process.returncode == 130

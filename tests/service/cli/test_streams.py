@@ -18,6 +18,7 @@ import pytest
 from t6gps.service.config import load
 from t6gps.storage import catalog
 
+pytestmark = pytest.mark.slow  # each starts processes
 COMMANDS = {
     "help": ["--help"],
     "runs": ["runs"],

@@ -97,10 +97,12 @@ def serial(tiny: Trained) -> dict[str, str]:
 
 
 @pytest.mark.slow
-@pytest.mark.ray
-def test_t15_serial_and_ray_give_identical_episodes_and_weights(tmp_path: Path, serial: dict[str, str]) -> None:
+def test_t15_serial_and_ray_give_identical_episodes_and_weights(
+    ray_head: dict[str, str], tmp_path: Path, serial: dict[str, str]
+) -> None:
     config = load("flat-quick", [*TINY, "run.workers=1"])
-    executor = RayExecutor(config)
+    with joining(ray_head):
+        executor = RayExecutor(config)
     assert result_of(config, executor, tmp_path) == serial
     assert executor.pool.phases.spent_s().keys() == set(RUN_PHASES), "what is told of a run is what the metrics know"
 

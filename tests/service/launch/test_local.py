@@ -14,6 +14,7 @@ import pytest
 import run_digest
 import tiny_run
 from command import t6gps
+from house import joining
 from tiny_run import Trained
 
 from t6gps.service.launch import job as records
@@ -46,16 +47,18 @@ def family(job: Job) -> list[int]:
     return [pid, *processes.descendants(pid)]
 
 
-def test_a_job_outlives_its_terminal_and_comes_home(tiny: Trained, tmp_path: Path, wait_until: Wait) -> None:
+def test_a_job_outlives_its_terminal_and_comes_home(
+    tiny: Trained, tmp_path: Path, wait_until: Wait, ray_head: dict[str, str]
+) -> None:
     root = tmp_path / "runs"
     command = [sys.executable, "-m", "t6gps", "submit", "flat-quick", "--run", "tiny", "--root", str(root)]
-    shell = subprocess.Popen([*command, *tiny_run.settings()], start_new_session=True)
+    shell = subprocess.Popen([*command, *tiny_run.settings()], env=os.environ | ray_head, start_new_session=True)
     assert shell.wait() == 0
     job = records.jobs()[0]
     pid = int(job.native_id.split(":")[1])
     assert os.getsid(pid) == pid  # no terminal is there that could hang up
     assert "iteration 2" in t6gps("logs", "-f", "tiny", "--root", root).stdout.decode()
-    wait_until(lambda: state("tiny", root)["state"] in ENDED, 60.0)
+    wait_until(lambda: state("tiny", root)["state"] in ENDED, 240.0)
     assert state("tiny", root)["state"] == "done"
     home = t6gps("fetch", "tiny", "--root", root, "--to", tmp_path / "home").stdout.decode().strip()
     assert run_digest.digests(Path(home)) == tiny.digests
@@ -65,29 +68,32 @@ def test_a_job_stops_cleanly_and_leaves_no_process(tmp_path: Path, wait_until: W
     root = tmp_path / "runs"
     t6gps("submit", "flat-quick", "--run", "a", "--root", root, *LONG)
     job = records.jobs()[0]
-    wait_until(lambda: any((root / "a" / "checkpoints").glob("*")), 120.0)
+    wait_until(lambda: any((root / "a" / "checkpoints").glob("*")), 240.0)
     refused = t6gps("submit", "flat-quick", "--run", "a", "--resume", "--root", root, *LONG, code=2).stderr
     assert "is in use by process" in refused
     assert t6gps("scale", "a", "1", "--root", root).stdout.decode().startswith("run a has 1 workers")
     members = family(job)
     assert len(members) > 3
     assert "is stopped; --resume continues it" in t6gps("stop", "a", "--root", root).stdout.decode()
-    wait_until(lambda: not any(processes.started(pid) for pid in members), 30.0)
+    wait_until(lambda: not any(processes.started(pid) for pid in members), 240.0)
     assert "everything sampled so far is kept" in t6gps("logs", "a", "--root", root).stdout.decode()
     assert "there is nothing to stop" in t6gps("stop", "a", "--root", root, code=2).stderr.replace("\n", " ")
 
 
-def test_a_job_that_is_killed_is_failed_and_resumes(tiny: Trained, tmp_path: Path, wait_until: Wait) -> None:
+def test_a_job_that_is_killed_is_failed_and_resumes(
+    tiny: Trained, tmp_path: Path, wait_until: Wait, ray_head: dict[str, str]
+) -> None:
     root = tmp_path / "runs"
     t6gps("submit", "flat-quick", "--run", "tiny", "--root", root, *tiny_run.settings())
     job = records.jobs()[0]
-    wait_until((root / "tiny").exists, 120.0)
+    wait_until((root / "tiny").exists, 240.0)
     for pid in family(job):
         os.kill(pid, signal.SIGKILL)
-    wait_until(lambda: state("tiny", root)["state"] in ENDED, 60.0)
+    wait_until(lambda: state("tiny", root)["state"] in ENDED, 240.0)
     assert state("tiny", root)["detail"].startswith("ended without a word")
-    wait_until(lambda: catalog.process_of(catalog.open_run(root, "tiny")) is None, 60.0)
-    t6gps("submit", "flat-quick", "--run", "tiny", "--resume", "--root", root, *tiny_run.settings())
+    wait_until(lambda: catalog.process_of(catalog.open_run(root, "tiny")) is None, 240.0)
+    with joining(ray_head):
+        t6gps("submit", "flat-quick", "--run", "tiny", "--resume", "--root", root, *tiny_run.settings())
     t6gps("logs", "-f", "tiny", "--root", root)
     assert state("tiny", root)["state"] == "done"
     assert run_digest.digests(root / "tiny") == tiny.digests

@@ -79,13 +79,13 @@ def test_t18_a_run_listens_on_loopback_outlives_a_worker_and_leaves_nothing_behi
         family = descendants(started.pid)
         for _ in range(2):  # the second stop does nothing
             started.send_signal(signal.SIGTERM)
-        _, message = started.communicate(timeout=120)
+        _, message = started.communicate(timeout=240)
     finally:
         started.kill()
     assert started.returncode == 130, message
     assert b"--resume" in message
     assert b"Traceback" not in message
-    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 60)
+    wait_until(lambda: not any(Path(f"/proc/{pid}").exists() for pid in family), 240)
     assert statuses.status(run)["state"] == "STOPPED"
     with pytest.raises(RunError, match=r"not running \(STOPPED.*--resume"):
         requests.scale(run, 2)

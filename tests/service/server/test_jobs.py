@@ -44,10 +44,16 @@ def client(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Iterator[Client]:
 
 
 @pytest.mark.slow
-@pytest.mark.ray
 def test_a_run_is_started_steered_stopped_and_resumed_from_afar(
-    client: Client, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, wait_until: Callable[..., None]
+    client: Client,
+    ray_head: dict[str, str],
+    tmp_path: Path,
+    monkeypatch: pytest.MonkeyPatch,
+    wait_until: Callable[..., None],
 ) -> None:
+    for name, value in ray_head.items():
+        monkeypatch.setenv(name, value)
+
     def far(*arguments: str) -> str:
         """What a command says with T6GPS_SERVER and T6GPS_TOKEN."""
         return t6gps(*arguments).stdout.decode()
@@ -105,7 +111,7 @@ def test_a_run_has_one_job_whose_end_is_told_and_leaves_no_zombie(
     assert ended is not None and ended.state is JobState.FAILED
     assert "no Ray answers" in ended.detail
     pid = int(job.native_id.split(":")[1])
-    wait_until(lambda: not Path(f"/proc/{pid}").exists(), 60)
+    wait_until(lambda: not Path(f"/proc/{pid}").exists(), 240)
 
 
 @pytest.mark.parametrize(

@@ -54,7 +54,7 @@ def test_it_serves_without_a_run_and_ends_quietly_when_it_is_told_to(tmp_path: P
         t6gps("token", "revoke", "me", "--root", tmp_path)
         assert httpx.get(f"{url}/v1/runs", headers=headers, trust_env=False).status_code == 401
         os.kill(process.pid, signal.SIGTERM)
-        _, last = process.communicate(timeout=60)
+        _, last = process.communicate(timeout=240)
     assert process.returncode == 0
     assert "ended" in last
     assert "Traceback" not in last

@@ -95,7 +95,7 @@ def test_a_run_in_one_process_is_stopped_and_resumes(tmp_path: Path, wait_until:
     try:
         wait_until(lambda: any(tmp_path.glob("one/spool/*/episode-*")), 240)
         assert requests.stop(catalog.open_run(tmp_path, "one")) == "STOPPED; --resume continues it"
-        _, message = process.communicate(timeout=120)
+        _, message = process.communicate(timeout=240)
     finally:
         process.kill()
     assert process.returncode == 130

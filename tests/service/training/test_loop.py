@@ -91,7 +91,8 @@ def test_a_resumed_run_equals_an_uninterrupted_one_bit_for_bit(
 
 
 def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its_tables(tmp_path: Path) -> None:
-    config = load("flat-quick", [*TINY, "learner.value_from=1"])
+    few = ("learner.action_value.first_steps=20", "learner.action_value.steps=10")
+    config = load("flat-quick", [*TINY, "learner.value_from=1", *few])
     whole, stopped = (catalog.create(tmp_path, name, config.to_json()) for name in ("whole", "stopped"))
     trained(config, whole, SerialExecutor(config))
     for stop in (StopsAfter(config, phase="backward_pass"), StopsAfter(config, episodes=1)):  # iterations 1 and 2

@@ -19,7 +19,7 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.objects import publishing
 from t6gps.storage.objects.place import ObjectPath
 
-WAIT_S = 60.0
+WAIT_S = 240.0
 pytestmark = pytest.mark.slow
 Wait = Callable[..., None]
 

@@ -58,6 +58,7 @@ def test_an_empty_run_a_cut_off_commit_and_a_policy_without_tables_are_sound(
     assert verify(worked) == []
 
 
+@pytest.mark.slow
 def test_a_run_that_works_meanwhile_has_no_fault(worked: Run, iterate: Any, evaluate: Any) -> None:
     ended = Event()
 

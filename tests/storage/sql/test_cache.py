@@ -22,7 +22,7 @@ from t6gps.storage.records import Episode
 from t6gps.storage.sql import cache
 from t6gps.storage.sql.query import Question, query
 
-DEADLINE_S = 60.0
+DEADLINE_S = 240.0
 TABLES = ("frames", "episodes", "iterations", "evaluations")
 COSTS = "SELECT run, sum(cost) AS cost, count(*) AS n FROM episodes GROUP BY run ORDER BY run"
 

@@ -145,6 +145,7 @@ def test_what_sql_may_read_is_what_it_names(sql: str, read: set[str]) -> None:
     assert views.read_by(sql) == read
 
 
+@pytest.mark.slow
 def test_hundreds_of_files_fit_into_the_bounds(runs: list[Run]) -> None:
     many = [catalog.copy(runs[2], runs[2].path.parent, f"copy-{number}") for number in range(60)]
     found = query(Question(many, "SELECT count(DISTINCT run) AS runs, count(*) AS n, sum(cost) AS cost FROM frames"))

@@ -31,7 +31,7 @@ if len(sys.argv) > 2:
     query(Question([run], {ENDLESS!r}))
 """
 """It has no guard of __main__, as scripts of users have none."""
-GONE_S = 30.0
+GONE_S = 240.0
 
 
 @pytest.fixture(scope="module")
@@ -80,7 +80,7 @@ def test_one_that_was_stopped_leaves_nothing_and_another_is_answered_meanwhile(
 def test_one_that_is_killed_says_so_and_is_replaced(empty: Run, wait_until: Callable[..., None]) -> None:
     pid = ids(Question([empty], "SELECT 1"))
     with ThreadPoolExecutor(1) as threads:
-        asked = threads.submit(query, Question([empty], ENDLESS, timeout_s=60.0))
+        asked = threads.submit(query, Question([empty], ENDLESS, timeout_s=GONE_S))
         wait_until(lambda: bool(children(pid)), GONE_S)
         os.kill(pid, signal.SIGKILL)
         with pytest.raises(QueryError, match=r"process that starts queries has ended.*ask again"):

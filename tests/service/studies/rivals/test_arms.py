@@ -114,6 +114,7 @@ def test_the_folder_of_a_study_shows_rivals_along_their_training(
     assert "| gait | 1 | 0 |" in page
 
 
+@pytest.mark.slow
 def test_an_interrupted_rival_begins_anew_and_ends_alike(
     finished: tuple[Path, list[conduct.Finished]], tmp_path: Path
 ) -> None:
