@@ -43,11 +43,19 @@ _APPLICATION = "t6gps"
 
 def opened(run: Run, table: str) -> DeltaTable | None:
     """A table by its log, None before the first commit. DataError where the log is damaged."""
-    location = str(run.tables / table)
+    folder = run.tables / table
     options = store.delta_options() if place.is_object(run.path) else None
     with readable(run, table):
-        there = DeltaTable.is_deltatable(location, storage_options=options)
-        return DeltaTable(location, storage_options=options) if there else None
+        return DeltaTable(str(folder), storage_options=options) if _begun(folder / "_delta_log") else None
+
+
+def _begun(log: Path) -> bool:
+    """Whether a log has an entry. The library's own question would stop all threads until an object store answers."""
+    try:
+        names = place.sizes(log)
+    except FileNotFoundError:
+        return False
+    return any(name.endswith((".json", checkpoints.ENDING)) for name in names)
 
 
 def state(run: Run) -> tuple[tuple[int | str, ...], ...]:
