@@ -10,6 +10,8 @@ mkdir -p "$folder" || {
     exit 2
 }
 cp -L /job/config.toml /job/train.sh "$folder/"
+rm -f "$folder/publish" # of an earlier job
+[ ! -e /job/publish ] || cp -L /job/publish "$folder/"
 for ground in /job/ground.*; do
     if [ -e "$ground" ]; then
         mkdir -p "$folder/ground"

@@ -8,7 +8,10 @@ root=${folder%/.jobs/*}
 rm -f "$folder/exit_code"
 unset T6GPS_SERVER # the run is trained here
 
-t6gps train "$folder/config.toml" --run "${folder##*/}" --root "$root" --resume < /dev/null &
+publish=()
+[ ! -e "$folder/publish" ] || publish=(--publish "$(< "$folder/publish")")
+
+t6gps train "$folder/config.toml" --run "${folder##*/}" --root "$root" --resume "${publish[@]}" < /dev/null &
 train=$!
 trap 'kill -TERM "$train"' TERM
 

@@ -20,6 +20,7 @@ from t6gps.service.cli.options import (
     JobName,
     Json,
     Overrides,
+    Publish,
     Root,
     Server,
     Workers,
@@ -63,17 +64,22 @@ def submit(
         int | None, typer.Option(min=2, max=1000, help="As many runs, RUN-seed0 and so on, with training seeds from 0.")
     ] = None,
     resume: Annotated[bool, typer.Option("--resume", help="Continue a run whose job has ended.")] = False,
+    publish: Publish = None,
     dry_run: Annotated[bool, typer.Option("--dry-run", help="Print what would be done, and do nothing.")] = False,
     overrides: Overrides = None,
 ) -> None:
     """Train in a job: in the background, or on a cluster."""
     target = targets.read(to, None if to is Kind.LOCAL else target_file)
     launcher = launchers.of(target)
-    planned = submission.plan(source, with_workers(overrides, workers, autoscale), root, run_name, seeds, resume)
+    changes = with_workers(overrides, workers, autoscale)
+    planned = submission.plan(source, changes, root, run_name, seeds, resume, publish)
     if dry_run:
-        typer.echo(f"# {planned[0].folder.config}\n{planned[0].config.to_toml()}\n{launcher.render(planned)}")
+        published = "" if publish is None else f"# each run is published below {publish}\n"
+        typer.echo(
+            f"# {planned[0].folder.config}\n{planned[0].config.to_toml()}\n{published}{launcher.render(planned)}"
+        )
         return
-    launcher.check(planned[0].config)
+    launcher.check(planned)
     for job in submission.submit(launcher, to, target, source, planned):
         typer.echo(f"job {job.name} is submitted to {job.kind} as {job.native_id}; follow it: t6gps logs -f {job.name}")
 

@@ -93,7 +93,10 @@ def train(
 ) -> None:
     """Train a policy: sample, segment, fit, optimise, learn, and keep everything."""
     if server is not None and publish is not None:
-        raise ConfigError("--publish copies runs of this machine; leave out --publish or --server")
+        raise ConfigError(
+            "--publish takes the keys of this machine, and a server's runs are trained where it is; leave out "
+            f"--publish, and copy the run there with: t6gps cp RUN RUN --to {publish}"
+        )
     if server is not None:
         serving.train_there(server, source, run_name, with_workers(overrides, workers, autoscale), serial, resume)
         return
@@ -131,6 +134,7 @@ def study(
     out: Annotated[Path | None, typer.Option(help="Folder of the result; by default studies/NAME-SCALE.")] = None,
     workers: Workers = None,
     serial: Serial = False,
+    publish: Publish = None,
     overrides: Overrides = None,
 ) -> None:
     """Compare settings over seeds; run it again to resume it after an interruption."""
@@ -139,10 +143,11 @@ def study(
     chosen = declared.find(name)
     planned = conducting.trials(name, chosen, scale, seeds, with_workers(overrides, workers), arms)
     command = _study_command(name, scale, seeds, arms, root, out, overrides)
+    copies, display = publishing.target(publish), terminal.StudyDisplay()
     try:
-        finished = conducting.conduct(planned, root, name, chosen.conditions, serial, terminal.StudyDisplay())
+        finished = conducting.conduct(planned, root, name, chosen.conditions, serial, display, copies=copies)
     except KeyboardInterrupt:
-        _exit_interrupted(command)
+        _exit_interrupted(command + ([] if publish is None else ["--publish", publish]))
     from t6gps.service.studies import report
 
     files = report.write(out or Path("studies") / f"{name}-{scale}", name, chosen, command, finished)

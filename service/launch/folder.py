@@ -2,6 +2,7 @@
 
 config.toml   the configuration, resolved
 ground/       the file of the ground, where there is one
+publish       the root in an object store that gets a copy of the run, where there is one
 train.sh      what every job runs; a script of Slurm uses it
 log           everything that the job writes
 exit_code     how it ended, written by train.sh
@@ -24,7 +25,7 @@ from t6gps.storage import catalog, durable
 from t6gps.storage.errors import RunError, TerrainError
 from t6gps.workers.ground.ground import ground
 
-FOLDERS = ".jobs"
+FOLDERS, PUBLISH = ".jobs", "publish"
 
 
 @dataclass(frozen=True)
@@ -54,6 +55,14 @@ class Folder:
         return self.path / "train.sh"
 
     @property
+    def publish(self) -> str | None:
+        """The root in an object store that gets a copy of the run, s3://BUCKET/PREFIX; None for none."""
+        try:
+            return (self.path / PUBLISH).read_text(encoding="utf-8").strip()
+        except FileNotFoundError:
+            return None
+
+    @property
     def exit_code(self) -> int | None:
         """How the job ended, None where it has not said so."""
         try:
@@ -68,10 +77,11 @@ class Folder:
 
 @dataclass(frozen=True)
 class Planned:
-    """A job to be: what it trains, and its folder, which is not there yet."""
+    """A job to be: what it trains, its folder, which is not there yet, and where its run is published."""
 
     config: Config
     folder: Folder
+    publish: str | None = None
 
 
 def of(root: Path, run: str) -> Folder:
@@ -97,16 +107,17 @@ def check_ground(config: Config) -> None:
 
 
 @contextmanager
-def prepared(config: Config, folder: Folder) -> Iterator[None]:
+def prepared(planned: Planned) -> Iterator[None]:
     """The job's folder, written for a job that is submitted meanwhile; it is as it was where that fails.
 
     RunError where the root cannot be written, or another job takes the name at this moment.
     """
+    folder = planned.folder
     before = folder.path.with_name(f".{folder.run}.before")
     try:
         folder.path.parent.mkdir(parents=True, exist_ok=True)
         with durable.draft(folder.path) as draft:
-            write(config, folder, draft)
+            write(planned, draft)
             durable.sync_tree(draft)
             if before.exists():  # of a submission that was cut off
                 durable.discard(before)
@@ -129,11 +140,11 @@ def prepared(config: Config, folder: Folder) -> Iterator[None]:
     shutil.rmtree(before, ignore_errors=True)
 
 
-def write(config: Config, folder: Folder, draft: Path) -> None:
+def write(planned: Planned, draft: Path) -> None:
     """Write what a job's folder shall hold into an empty folder `draft`. TerrainError for ground that is missing."""
-    file = config.terrain.file
+    config, file = planned.config, planned.config.terrain.file
     if file is not None:
-        copy = folder.path / "ground" / Path(file).name
+        copy = planned.folder.path / "ground" / Path(file).name
         (draft / "ground").mkdir()
         try:
             shutil.copyfile(file, draft / "ground" / copy.name)
@@ -141,6 +152,8 @@ def write(config: Config, folder: Folder, draft: Path) -> None:
             raise TerrainError(f"cannot read ground from {file}: {error.strerror}; correct terrain.file") from error
         config = configuration.with_ground(config, copy)
     (draft / "config.toml").write_text(config.to_toml(), encoding="utf-8")
+    if planned.publish is not None:
+        (draft / PUBLISH).write_text(f"{planned.publish}\n", encoding="utf-8")
     script = resources.files("t6gps.deploy") / "launch" / "train.sh"
     (draft / "train.sh").write_bytes(script.read_bytes())
 

@@ -6,7 +6,6 @@ from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager
 from typing import Protocol
 
-from t6gps.service.config import Config
 from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import Job, JobState
@@ -16,8 +15,11 @@ from t6gps.service.steering.status import Status
 class Launcher(Protocol):
     """A target on which jobs run. Every method raises RunError where the target cannot be used or reached."""
 
-    def check(self, config: Config) -> None:
-        """ConfigError or RunError for a run that this target cannot take; nothing is changed."""
+    def check(self, planned: Sequence[Planned]) -> None:
+        """ConfigError, RunError or StoreError for runs that this target cannot take, or publish; nothing is changed.
+
+        They have one configuration, but for the seed.
+        """
         ...
 
     def render(self, planned: Sequence[Planned]) -> str:

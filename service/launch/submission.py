@@ -22,13 +22,21 @@ from t6gps.storage.errors import RunError
 
 
 def plan(
-    source: str, overrides: Sequence[str], root: Path, name: str | None, seeds: int | None, resume: bool
+    source: str,
+    overrides: Sequence[str],
+    root: Path,
+    name: str | None,
+    seeds: int | None,
+    resume: bool,
+    publish: str | None = None,
 ) -> list[Planned]:
     """The jobs that train a configuration: one, or RUN-seed0, RUN-seed1, ... with these training seeds.
 
     Without a name a run has the source's, with a number where that is taken. ConfigError and TerrainError for what
     cannot be trained; RunError for a name that is taken, for a job to resume that has not ended, and for one that has
     another configuration.
+
+    publish   root in an object store that gets a copy of each run, s3://BUCKET/PREFIX
     """
     stem = Path(source).stem if name is None else name
     if seeds is None:
@@ -38,7 +46,7 @@ def plan(
         each = {
             f"{stem}-seed{seed}": configuration.load(source, [*overrides, f"run.seed={seed}"]) for seed in range(seeds)
         }
-    planned = [Planned(config, folders.of(root, run)) for run, config in each.items()]
+    planned = [Planned(config, folders.of(root, run), publish) for run, config in each.items()]
     folders.check_ground(planned[0].config)
     for job in planned:
         _check_free(job, resume)
@@ -46,10 +54,13 @@ def plan(
 
 
 def continuing(run: Run, config: Config) -> Planned:
-    """The job that trains what is missing of a run. RunError where somebody trains it already."""
-    planned = Planned(config, folders.of(run.path.parent, run.name))
-    _check_ended(planned.folder)
-    return planned
+    """The job that trains what is missing of a run, and publishes it where the job before did.
+
+    RunError where somebody trains it already.
+    """
+    folder = folders.of(run.path.parent, run.name)
+    _check_ended(folder)
+    return Planned(config, folder, folder.publish)
 
 
 def submit(launcher: Launcher, kind: Kind, target: Target, source: str, planned: Sequence[Planned]) -> list[Job]:
@@ -58,7 +69,7 @@ def submit(launcher: Launcher, kind: Kind, target: Target, source: str, planned:
     each = [job.folder for job in planned]
     with ExitStack() as stack:
         for job in planned:
-            stack.enter_context(folders.prepared(job.config, job.folder))
+            stack.enter_context(folders.prepared(job))
         numbers = launcher.submit(planned)
         submitted: list[Job] = []
         try:

@@ -81,6 +81,10 @@ class K8s(Settings):
     cpus_per_pod: int = Field(4, ge=1, le=1024, description="CPUs of each pod with workers")
     memory_gb_per_pod: int = Field(8, ge=2, le=4096, description="memory of each pod with workers (GiB)")
     pods: int = Field(8, ge=1, le=1000, description="most pods with workers of a run")
+    store_secret: str | None = Field(
+        None, pattern=DNS_NAME, description="Secret with the variables AWS_... of the object store, for --publish"
+    )
+    store_port: int = Field(443, ge=1, le=65535, description="port of the object store, for --publish")
     retries: int = Field(3, ge=0, le=100, description="times that a job is started anew whose head was lost")
 
 

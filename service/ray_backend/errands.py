@@ -30,6 +30,8 @@ from t6gps.service.steering import status as statuses
 from t6gps.service.steering.status import Status
 from t6gps.storage import catalog, durable
 from t6gps.storage.errors import RunError, T6GpsError
+from t6gps.storage.objects import publishing
+from t6gps.storage.objects.place import whole
 
 NODES_DEADLINE_S = 60.0
 """For an answer of all nodes, each of which starts a process for it."""
@@ -153,6 +155,17 @@ def remove(root: str, *runs: str) -> None:
         durable.discard(Path(root) / JOBS / run)
 
 
+def publish(root: str, address: str, *runs: str) -> None:
+    """See that runs can be published from here, where they train: keys, store, and no other runs of these names there.
+
+    ConfigError without keys, StoreError where the store takes nothing, RunError where it has other runs.
+    """
+    target = whole(Path(address))
+    publishing.probe(target)
+    for run in runs:
+        publishing.check_same(Path(root) / run, target / run)
+
+
 def status(root: str, run: str) -> Status | None:
     """As `statuses.begun`."""
     return statuses.begun(Path(root), run)
@@ -164,7 +177,7 @@ def scale(root: str, run: str, workers: str, deadline_s: str) -> Status:
 
 
 ERRANDS: dict[str, Callable[..., object]] = {
-    function.__name__: function for function in (look, place, remove, status, scale)
+    function.__name__: function for function in (look, place, remove, publish, status, scale)
 }
 
 

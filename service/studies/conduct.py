@@ -22,13 +22,14 @@ from t6gps.service.studies.rivals import arms as rivals
 from t6gps.service.studies.rivals import curve
 from t6gps.service.studies.rivals.curve import Point
 from t6gps.service.studies.watcher import Watcher
-from t6gps.service.training import evaluation, session
+from t6gps.service.training import evaluation, publishing, session
 from t6gps.service.training import origin as run_origin
 from t6gps.service.training.evaluation import Evaluation
 from t6gps.service.views import run_figures
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, RunError
+from t6gps.storage.objects.place import ObjectPath
 
 SECONDS_PER_STEP = {True: 0.0005, False: 0.0003}
 LEARNING_SECONDS_PER_STEP: dict[Baseline | Rival | None, float] = {
@@ -127,12 +128,16 @@ def conduct(
     serial: bool,
     watcher: Watcher,
     present: str | None = None,
+    copies: ObjectPath | None = None,
 ) -> list[Finished]:
     """Run what is missing of the trials below `root`, then evaluate each policy under `conditions` (overrides by name).
 
     Returns the results in the order of the plan. RunError if a run of that name has another configuration, ConfigError
     if an arm lacks a library, both before anything is sampled. Runs that another commit began are kept and said to be
     so; `present` is the commit at work, by default the one that is checked out.
+
+    copies   root in an object store that gets a copy of each run; before anything is sampled StoreError where it takes
+             none, RunError where it holds another run of such a name
     """
     present = present or commit()
     catalog.folder(root)
@@ -140,6 +145,8 @@ def conduct(
     _warn_of_other_commits(list(runs.values()), present, watcher)
     missing = [trial for trial in planned if trial.name not in runs or evaluation.kept(runs[trial.name]) is None]
     libraries.check_installed({trial.arm: trial.declared.baseline for trial in missing})
+    if copies is not None:
+        publishing.check_all([Run(catalog.whole(root) / trial.name) for trial in planned], copies, watcher.warn)
     unseen = [
         (trial, condition)
         for trial in planned
@@ -157,8 +164,23 @@ def conduct(
         watcher.say(f"{progress}; {minutes(pace.left_s())} left")
         run = runs.get(trial.name) or run_origin.create(trial.config, root, trial.name)
         with recorded(run, study, trial.arm, trial.seed, present):
-            _complete(trial, run, serial, watcher)
+            _complete(trial, run, serial, watcher, copies)
+        _publish([run], copies, watcher)
         pace.done(estimate_s([trial], 0))
+    _see(unseen, root, conditions, serial, watcher, pace)
+    _publish([catalog.open_run(root, trial.name) for trial in planned], copies, watcher)
+    return [_finished(root, trial, conditions) for trial in planned]
+
+
+def _see(
+    unseen: Sequence[tuple[Trial, str]],
+    root: Path,
+    conditions: Mapping[str, tuple[str, ...]],
+    serial: bool,
+    watcher: Watcher,
+    pace: _Pace,
+) -> None:
+    """Evaluate the policies of trials under other conditions."""
     for number, (trial, condition) in enumerate(unseen, 1):
         progress = f"condition {number} of {len(unseen)}: {condition}, run {trial.name}"
         watcher.say(f"{progress}; {minutes(pace.left_s())} left")
@@ -166,7 +188,6 @@ def conduct(
         overrides = conditions[condition]
         evaluation.keep(run, _evaluated(trial, run, condition, overrides, serial, watcher), condition)
         pace.done(_condition_s(trial))
-    return [_finished(root, trial, conditions) for trial in planned]
 
 
 def _begun(planned: Sequence[Trial], root: Path) -> dict[str, Run]:
@@ -181,7 +202,16 @@ def _begun(planned: Sequence[Trial], root: Path) -> dict[str, Run]:
     return runs
 
 
-def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
+def _publish(runs: Sequence[Run], copies: ObjectPath | None, watcher: Watcher) -> None:
+    """Copy what is left to copy of runs that are finished as far as the study is."""
+    if copies is None:
+        return
+    for run in runs:
+        with watcher.task(f"publishing {run.name}") as progress:
+            publishing.catch_up(run, copies, progress)
+
+
+def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher, copies: ObjectPath | None) -> None:
     """Train, evaluate and draw what is missing of a trial."""
     baseline = trial.declared.baseline
     if isinstance(baseline, Rival):
@@ -191,7 +221,7 @@ def _complete(trial: Trial, run: Run, serial: bool, watcher: Watcher) -> None:
         baselines.complete(baseline, trial.config, run, watcher)
         return
     with watcher.run(trial.config.run.iterations) as observer:
-        session.complete(trial.config, run, serial, observer)
+        session.complete(trial.config, run, serial, observer, copies)
     run_figures.draw(run, run_origin.configured(run))
 
 

@@ -40,7 +40,7 @@ def main() -> int:
             publishing.publish(run.path, target, publishing.AT_WORK)
         except (T6GpsError, OSError) as trouble:
             error = trouble
-        _tell(run, target, error)
+        tell(run, target, error)
         away = isinstance(error, StoreUnreachableError | OSError)
         if until_s < float("inf") and (not away or time.monotonic() > until_s):
             return int(error is not None)
@@ -50,7 +50,8 @@ def main() -> int:
             time.sleep(AGAIN_S)
 
 
-def _tell(run: Run, target: ObjectPath, error: Exception | None) -> None:
+def tell(run: Run, target: ObjectPath, error: Exception | None) -> None:
+    """Say of a run how far it is copied, and what the last attempt met."""
     try:
         there_n = publishing.iterations(target)
     except (T6GpsError, OSError):

@@ -7,7 +7,7 @@ import os
 import shlex
 import subprocess
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any, final
@@ -17,7 +17,7 @@ from t6gps.service.training import publisher
 from t6gps.service.training.loop import Observer
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import ConfigError, RunError, StoreUnreachableError
+from t6gps.storage.errors import ConfigError, RunError, StoreUnreachableError, T6GpsError
 from t6gps.storage.objects import place, publishing
 from t6gps.storage.objects.place import ObjectPath
 
@@ -25,15 +25,22 @@ LAST_WAIT_S = publisher.END_S + 5.0
 _log = logging.getLogger(__name__)
 
 
-def target(address: str | None) -> ObjectPath | None:
-    """The root in an object store that an address names. ConfigError for another address."""
-    if address is None:
+def address(text: str | None) -> ObjectPath | None:
+    """The root in an object store that a text names, None for none. ConfigError for another address.
+
+    Whether it can be reached from here is not asked.
+    """
+    if text is None:
         return None
-    if not place.is_object(Path(address)):
-        raise ConfigError(
-            f"--publish takes s3://BUCKET/PREFIX, found {address!r}; copies to folders are made by t6gps cp"
-        )
-    return place.whole(Path(address))
+    if not place.is_object(Path(text)):
+        raise ConfigError(f"--publish takes s3://BUCKET/PREFIX, found {text!r}; copies to folders are made by t6gps cp")
+    return place.addressed(Path(text))
+
+
+def target(text: str | None) -> ObjectPath | None:
+    """As `address`, for a process that will write there. ConfigError also without keys, or without obstore."""
+    root = address(text)
+    return None if root is None else place.whole(root)
 
 
 def probe(root: ObjectPath, resumes: bool, warn: Callable[[str], object]) -> None:
@@ -47,9 +54,31 @@ def probe(root: ObjectPath, resumes: bool, warn: Callable[[str], object]) -> Non
 
 
 def check(run: Run, root: ObjectPath) -> None:
-    """RunError where the root holds another run of that name; nothing is known of a store that is away."""
+    """RunError where the root holds another run of that name; nothing is known of a store that is away.
+
+    A run that is not there yet must find no other one.
+    """
     with suppress(StoreUnreachableError):  # `probe` has told of it
         publishing.check_same(run.path, root / run.name)
+
+
+def check_all(runs: Sequence[Run], root: ObjectPath, warn: Callable[[str], object]) -> None:
+    """See that a store takes runs, of which some are not there yet. Errors as `probe` and `check`."""
+    probe(root, any(run.path.exists() for run in runs), warn)
+    for run in runs:
+        check(run, root)
+
+
+def catch_up(run: Run, root: ObjectPath, progress: publishing.Progress) -> None:
+    """Copy what is left to copy of a run, which others may use; a warning says why something is left still."""
+    copy, error = root / run.name, None
+    try:
+        publishing.publish(run.path, copy, publishing.AT_WORK, progress)
+    except (T6GpsError, OSError) as trouble:
+        error = trouble
+    publisher.tell(run, copy, error)
+    if error is not None:
+        _tell_left(run, root)
 
 
 @contextmanager

@@ -27,6 +27,8 @@ _USED = {
 """What readers use of the actions of a commit."""
 _MANY = ("add", "txn")
 """Actions of which a table has several, by the first that is used of them; of the others the last one holds."""
+CONTRADICTED = "it does not say what the commits of the log say"
+"""Of a checkpoint: one of the two was altered."""
 _State = dict[tuple[str, object], tuple[object, ...]]
 
 
@@ -98,5 +100,5 @@ def _compared(run: Run, table: str, checkpoint: Path, state: _State) -> list[Fau
         place.answers(checkpoint, error)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
     else:
-        what = "" if said == state else "it does not say what the commits of the log say"
+        what = "" if said == state else CONTRADICTED
     return [Fault(table, within(run, checkpoint), what, repairable=True)] if what and checkpoint.exists() else []

@@ -119,28 +119,63 @@ def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, s
 def examine(run: Run, found: Found, entry: Entry) -> None:
     """Read a file whole, every page against its CRC-32; keep its keys, or say what is wrong.
 
-    StoreError where its object store does not answer.
+    A file that has the SHA-256 of its commit is as it was written, so that what contradicts it is the log. StoreError
+    where its object store does not answer.
     """
     try:
+        sound = _as_written(entry)
         keys = _keys(found.table, entry)
+        wrong = _contradicted(entry, keys)
+        if wrong is not None and not sound:
+            raise ValueError(wrong)
+        kept = _by_episode(keys) if "frames" in found.table else keys
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
         place.answers(entry.path, error)
         what = (str(error).splitlines() or [type(error).__name__])[0][: log.MESSAGE_LENGTH_N]
         found.faults.append(Fault(found.table, within(run, entry.path), what, entry.number))
     else:
-        found.keys[entry.path.name] = keys
+        if wrong is not None:
+            log_of = f"tables/{found.table}/_delta_log"
+            what = f"of {entry.path.name} {wrong.removeprefix('its log ')}, and the file has its SHA-256"
+            found.faults.append(Fault(found.table, log_of, what, entry.number, repairable=True))
+        found.keys[entry.path.name] = kept
+
+
+def _as_written(entry: Entry) -> bool:
+    """True where a file has the SHA-256 that its commit has, False where that has none; ValueError where it has not."""
+    if not entry.path.exists():
+        raise ValueError("it is missing")
+    if entry.sha256 == durable.sha256(entry.path):
+        return True
+    wrong = _size(entry)
+    if wrong is None and entry.sha256 is not None:
+        wrong = "its SHA-256 is another than its log has"
+    if wrong is not None:
+        raise ValueError(wrong)
+    return False
+
+
+def _size(entry: Entry) -> str | None:
+    size = entry.path.stat().st_size
+    return None if size == entry.size else f"its log has {entry.size} bytes, found {size}"
+
+
+def _contradicted(entry: Entry, keys: pa.Table) -> str | None:
+    """What a commit has of a file that it does not have."""
+    size = _size(entry)
+    if size is not None:
+        return size
+    if entry.rows_n not in (None, keys.num_rows):
+        return f"its log has {entry.rows_n} rows, found {keys.num_rows}"
+    for name, ends in entry.ranges.items():
+        there = pc.min_max(keys.column(name)).as_py()
+        if ends != (there["min"], there["max"]):
+            return f"its log has {ends[0]} .. {ends[1]} for {name}, found {there['min']} .. {there['max']}"
+    return None
 
 
 def _keys(table: str, entry: Entry) -> pa.Table:
-    """The keys of a file that is as it was written, else some error."""
-    try:
-        size = entry.path.stat().st_size
-    except FileNotFoundError:
-        raise ValueError("it is missing") from None
-    if size != entry.size:
-        raise ValueError(f"its log has {entry.size} bytes, found {size}")
-    if entry.sha256 not in (None, durable.sha256(entry.path)):
-        raise ValueError("it was altered: it fails the SHA-256 in its log")
+    """The keys of a file that is whole by itself, else some error."""
     with pq.ParquetFile(place.source(entry.path), page_checksum_verification=True) as file:
         wrong = parquet.differs(table, file.schema_arrow)
         if wrong is not None:
@@ -152,14 +187,7 @@ def _keys(table: str, entry: Entry) -> pa.Table:
                 for row in rows.to_pylist():
                     policies.policy(row)  # against its SHA-256
             groups.append(rows.select(KEYS[table]))
-    keys = pa.concat_tables(group.replace_schema_metadata(None).cast(_bare(table)) for group in groups)
-    if entry.rows_n not in (None, keys.num_rows):
-        raise ValueError(f"its log has {entry.rows_n} rows, found {keys.num_rows}")
-    for name, ends in entry.ranges.items():
-        there = pc.min_max(keys.column(name)).as_py()
-        if ends != (there["min"], there["max"]):
-            raise ValueError(f"its log has {ends[0]} .. {ends[1]} for {name}, found {there['min']} .. {there['max']}")
-    return _by_episode(keys) if "frames" in table else keys
+    return pa.concat_tables(group.replace_schema_metadata(None).cast(_bare(table)) for group in groups)
 
 
 def _bare(table: str) -> pa.Schema:

@@ -17,23 +17,35 @@ from t6gps.storage.care.mending import DAMAGED, set_aside
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import checkpoints
 
-AGAIN = {
-    "spool": "its episode is sampled again when the run is resumed",
-    "checkpoints": "another one serves when the run is resumed",
-    "evaluation": "it is evaluated again when the run is resumed",
-}
-"""What becomes of parts that a run can do without."""
+APART = ("spool", "checkpoints", "evaluation")
+"""Parts that a run can do without."""
 
 
 def without(draft: Run, faults: Iterable[Fault]) -> list[str]:
     """Set aside what is damaged; what is lost, and how it comes again."""
-    sentences = []
-    for fault in faults:
-        if fault.part in AGAIN:
-            set_aside(draft, fault.place)
-            sentences.append(f"{fault.place} is set aside in {DAMAGED}/: {AGAIN[fault.part]}")
-    sentences += _iterations(draft, _first(faults, schema.OF_ITERATIONS))
-    return sentences + _evaluations(draft, _first(faults, schema.OF_EVALUATIONS))
+    apart = [fault for fault in faults if fault.part in APART]
+    for fault in apart:
+        set_aside(draft, fault.place)
+    lost = _iterations(draft, _first(faults, schema.OF_ITERATIONS))
+    lost += _evaluations(draft, _first(faults, schema.OF_EVALUATIONS))
+    return [f"{fault.place} is set aside in {DAMAGED}/: {_again(draft, fault)}" for fault in apart] + lost
+
+
+def _again(draft: Run, fault: Fault) -> str:
+    """What becomes of a part that is set aside."""
+    states = checkpoint.kept(draft.checkpoints)
+    if fault.part == "checkpoints":
+        if not states:
+            return "there is no other one, so that a run that is resumed begins anew, to the same bytes"
+        return f"{within(draft, states[max(states)])} serves when the run is resumed"
+    if fault.part == "spool":
+        iteration = int(Path(fault.place).parent.name.removeprefix("iteration-"))
+        if iteration < max(states, default=0):
+            return "its iteration is finished, and nothing needs it"
+        return "its episode is sampled again when the run is resumed"
+    if fault.place.startswith("conditions/"):
+        return "it is evaluated again when the study is run again"
+    return "it is evaluated again when the run is resumed"
 
 
 def _first(faults: Iterable[Fault], tables: Mapping[str, object]) -> int | None:

@@ -6,13 +6,13 @@ Each changes a draft of the run, in which files are links to the run's own: file
 from __future__ import annotations
 
 import shutil
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from pathlib import Path
 
 import pyarrow as pa
 
 from t6gps.storage import durable, schema, spool
-from t6gps.storage.care import delta_files
+from t6gps.storage.care import commits, delta_files
 from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import checkpoints, iterations, log, parquet
@@ -33,13 +33,31 @@ def set_aside(draft: Run, place: str) -> None:
         path.rename(target)
 
 
-def without_checkpoints(draft: Run, faults: Iterable[Fault]) -> list[str]:
-    """Set the checkpoints of logs aside that have a damaged one, since the commits say the same; what was done."""
-    logs = {Path(fault.place).parent for fault in faults if fault.place.endswith(checkpoints.ENDING)}
-    for folder in sorted(logs):
-        for state in checkpoints.kept(draft.path / folder):
+def without_checkpoints(draft: Run, faults: Iterable[Fault]) -> dict[str, str]:
+    """Set the checkpoints of logs aside that have a damaged one; what was wrong with it, by the table."""
+    wrong = {fault.part: fault for fault in faults if fault.place.endswith(checkpoints.ENDING)}
+    for fault in wrong.values():
+        for state in checkpoints.kept((draft.path / fault.place).parent):
             set_aside(draft, within(draft, state))
-    return [f"checkpoints of {folder} are set aside in {DAMAGED}/: the commits say the same" for folder in sorted(logs)]
+    return {table: fault.what for table, fault in sorted(wrong.items())}
+
+
+def told(wrong: Mapping[str, str], left: Iterable[Fault]) -> list[str]:
+    """What was done by `without_checkpoints`.
+
+    left   faults of the run without these checkpoints: those of a table say that its commits are not right either
+    """
+    also = {fault.part for fault in left}
+    return [
+        f"checkpoints of tables/{table}/_delta_log are set aside in {DAMAGED}/: {_why(what, table in also)}"
+        for table, what in wrong.items()
+    ]
+
+
+def _why(what: str, also: bool) -> str:
+    if what != commits.CONTRADICTED:
+        return f"one cannot be read ({what}), and the log has all commits"
+    return "they contradict the commits" + ("" if also else ", which fit the files")
 
 
 def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[Fault]) -> list[str]:

@@ -69,9 +69,10 @@ def _mended(
 ) -> list[str]:
     hidden = shutil.ignore_patterns(".*")
     shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=durable.link, ignore=hidden)
-    sentences = mending.without_checkpoints(draft, faults)
-    if sentences:
+    wrong = mending.without_checkpoints(draft, faults)
+    if wrong:
         faults = verify(draft)
+    sentences = mending.told(wrong, faults)
     if copy is not None:
         unsound = verify(copy)
         for take in (mending.from_copy, mending.tables_from_copy):

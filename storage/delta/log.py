@@ -34,17 +34,28 @@ SHA256 = "sha256"
 _COLOUR = re.compile("\x1b\\[[0-9;]*m")
 _SYSTEM_ERROR = re.compile(r"\(os error (\d+)\)")
 
+_NO_HOOKS = PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False)
+"""The library would not force to disk what it writes after a commit."""
+
 _APPLICATION = "t6gps"
 """Application id of the Delta transactions; their version is the number of the file."""
 
 
 def opened(run: Run, table: str) -> DeltaTable | None:
     """A table by its log, None before the first commit. DataError where the log is damaged."""
-    location = str(run.tables / table)
+    folder = run.tables / table
     options = store.delta_options() if place.is_object(run.path) else None
     with readable(run, table):
-        there = DeltaTable.is_deltatable(location, storage_options=options)
-        return DeltaTable(location, storage_options=options) if there else None
+        return DeltaTable(str(folder), storage_options=options) if _begun(folder / "_delta_log") else None
+
+
+def _begun(log: Path) -> bool:
+    """Whether a log has an entry. The library's own question would stop all threads until an object store answers."""
+    try:
+        names = place.sizes(log)
+    except FileNotFoundError:
+        return False
+    return any(name.endswith((".json", checkpoints.ENDING)) for name in names)
 
 
 def state(run: Run) -> tuple[tuple[int | str, ...], ...]:
@@ -130,6 +141,7 @@ def _commit(run: Run, table: str, delta: DeltaTable | None, file: Path, number: 
     folder, definition = run.tables / table, Schema.from_arrow(schema.TABLES[table])
     with _writing(folder):
         delta = delta or DeltaTable.create(str(folder), definition)
+        columns_came = _widened(delta, definition)
         delta.create_write_transaction(
             [AddAction(file.name, file.stat().st_size, {}, int(time.time() * 1000), True, statistics.to_json())],
             "append",
@@ -137,18 +149,29 @@ def _commit(run: Run, table: str, delta: DeltaTable | None, file: Path, number: 
             commit_properties=CommitProperties(
                 custom_metadata={SHA256: durable.sha256(file)}, app_transactions=[Transaction(_APPLICATION, number)]
             ),
-            # The library does not force them to disk.
-            post_commithook_properties=PostCommitHookProperties(create_checkpoint=False, cleanup_expired_logs=False),
+            post_commithook_properties=_NO_HOOKS,
         )
     log = folder / "_delta_log"
     entries = sorted(log.glob("*.json"))
-    for entry in entries[-2:]:  # the commit, and the table's creation before the first
+    for entry in entries[-2:]:  # the commit, and what may come with it: the table's creation, or new columns
         durable.sync(entry)
     for parent in (log, folder, run.tables):
         durable.sync(parent)
-    if int(entries[-1].stem) % checkpoints.EVERY_N == 0:
+    if int(entries[-1].stem) % checkpoints.EVERY_N < (2 if columns_came else 1):
         with _writing(folder):
             checkpoints.write(folder)
+
+
+def _widened(delta: DeltaTable, definition: Schema) -> bool:
+    """Add the columns to a table that an earlier version did not know, in a commit of its own; whether there are any.
+
+    Readers of Delta tables see what the log names. Rows of earlier files have null there.
+    """
+    known = {field.name for field in delta.schema().fields}
+    later = [field for field in definition.fields if field.name not in known]
+    if later:
+        delta.alter.add_columns(later, post_commithook_properties=_NO_HOOKS)
+    return bool(later)
 
 
 @contextmanager

@@ -47,6 +47,11 @@ def whole(path: Path) -> ObjectPath:
     """A place in an object store. RunError for an address that none can have, ConfigError without keys or obstore."""
     store.access()
     store.require()
+    return addressed(path)
+
+
+def addressed(path: Path) -> ObjectPath:
+    """A place in an object store that others may reach. RunError for an address that none can have."""
     bucket, keys = path.parts[1:2], path.parts[2:]
     if not bucket or not _BUCKET.fullmatch(bucket[0]):
         raise RunError(f"an object store is s3://BUCKET or s3://BUCKET/PREFIX, found {path}; name a bucket")

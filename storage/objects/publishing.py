@@ -14,6 +14,7 @@ import hashlib
 import json
 import mmap
 import secrets
+import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
@@ -50,13 +51,15 @@ class _Step:
 class _Commit:
     """A commit to a table, in the order in which commits are copied: one iteration after the other.
 
-    number   of its iteration or evaluation; -1 for the commit that makes the table
-    files    what it adds, then its own entry of the log
+    number   of its iteration or evaluation; of a commit that adds no file, that of the next one that does
+    entry    of the log
+    files    what it adds, then its entry
     """
 
     of_evaluations: bool
     number: int
     last: bool
+    entry: str
     files: tuple[str, ...]
 
 
@@ -127,9 +130,10 @@ def fetch(source: ObjectPath, folder: Path, progress: Progress) -> None:
 
 
 def iterations(run: Path) -> int:
-    """How many iterations a run has by the log of `episodes`, here or in a store."""
-    commits = len(list((run / "tables" / "episodes" / "_delta_log").glob("*.json")))
-    return max(0, commits - 1)  # the first makes the table
+    """How many iterations a run has by the log of `episodes`, here or in a store. RunError where its end is torn."""
+    entries = sorted((run / "tables" / "episodes" / "_delta_log").glob("*.json"), reverse=True)
+    numbers = (_said(entry)[0] for entry in entries)
+    return next((number + 1 for number in numbers if number is not None), 0)
 
 
 def _check_same(run: Path, target: ObjectPath, there: Mapping[str, int]) -> None:
@@ -198,15 +202,29 @@ def _steps(run: Path, there: Mapping[str, int], states: tuple[str, ...], without
 def _commits(run: Path, table: str, there: Mapping[str, int]) -> list[_Commit]:
     """The commits to a table that are not there."""
     entries = sorted((run / "tables" / table / "_delta_log").glob("*.json"))
-    left = {entry.relative_to(run).as_posix(): entry for entry in entries}
-    return [_commit(table, file, entry) for file, entry in left.items() if file not in there]
+    commits, number = list[_Commit](), sys.maxsize
+    for entry in reversed(entries):
+        file = entry.relative_to(run).as_posix()
+        if file in there:
+            continue
+        added, paths = _said(entry)
+        number = number if added is None else added
+        data = (f"tables/{table}/{path}" for path in paths)
+        commits.append(_Commit(table in schema.OF_EVALUATIONS, number, table in LAST, file, (*data, file)))
+    return commits
 
 
-def _commit(table: str, file: str, entry: Path) -> _Commit:
-    actions = [json.loads(line) for line in entry.read_text(encoding="utf-8").splitlines()]
-    number = next((action["txn"]["version"] for action in actions if "txn" in action), -1)
-    data = (f"tables/{table}/{action['add']['path']}" for action in actions if "add" in action)
-    return _Commit(table in schema.OF_EVALUATIONS, number, table in LAST, (*data, file))
+def _said(entry: Path) -> tuple[int | None, list[str]]:
+    """The iteration or evaluation that a commit adds, None for one that makes a table or gives it columns; its files.
+
+    RunError where it is torn.
+    """
+    try:
+        actions = [json.loads(line) for line in entry.read_text(encoding="utf-8").splitlines()]
+        number = next((int(action["txn"]["version"]) for action in actions if "txn" in action), None)
+        return number, [str(action["add"]["path"]) for action in actions if "add" in action]
+    except (ValueError, LookupError, TypeError) as error:
+        raise RunError(f"{entry} is no commit: {error!r}; mend the run with t6gps repair") from None
 
 
 def _others(run: Path, without: tuple[str, ...]) -> Iterator[str]:

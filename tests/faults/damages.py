@@ -7,6 +7,7 @@ import os
 import shutil
 from collections.abc import Callable
 from pathlib import Path
+from typing import Any
 
 import pyarrow as pa
 import pyarrow.parquet as pq
@@ -51,6 +52,26 @@ def commit_of(table: str, number: int) -> str:
     return f"tables/{table}/_delta_log/{number:020d}.json"
 
 
+def alter(run: Run, table: str, number: int, change: Callable[[dict[str, Any]], object]) -> None:
+    """Change what the commit of a file says of it; the file stays as it is."""
+    commit = run.path / commit_of(table, number + 1)
+    actions = [json.loads(line) for line in commit.read_text().splitlines()]
+    for action in actions:
+        if "add" in action:
+            change(action["add"])
+    commit.write_text("\n".join(map(json.dumps, actions)))
+
+
+def _stats(add: dict[str, Any], **changed: object) -> None:
+    add["stats"] = json.dumps(json.loads(add["stats"]) | changed)
+
+
+ALTERED: dict[str, Callable[[dict[str, Any]], object]] = {
+    "size": lambda add: add.update(size=add["size"] + 1),
+    "rows": lambda add: _stats(add, numRecords=7),
+    "range": lambda add: _stats(add, minValues={"iteration": 0}, maxValues={"iteration": 9}),
+}
+"""What may be wrong in a commit whose file is as it was."""
 DAMAGES: dict[str, tuple[str, Callable[[Run], object]]] = {
     "a bit of a page": ("frames", lambda run: flip(run.tables / "frames" / "iteration-000001.parquet", 2000)),
     "a bit of a footer": ("classes", lambda run: flip(run.tables / "classes" / "iteration-000001.parquet", -60)),
@@ -58,6 +79,10 @@ DAMAGES: dict[str, tuple[str, Callable[[Run], object]]] = {
     "no file": ("episodes", lambda run: (run.tables / "episodes" / "iteration-000002.parquet").unlink()),
     "gap in a log": ("iterations", lambda run: (run.path / commit_of("iterations", 1)).unlink()),
     "torn commit": ("policies", lambda run: os.truncate(run.path / commit_of("policies", 2), 60)),
+    **{
+        f"a commit's {name}": ("frames", lambda run, change=change: alter(run, "frames", 1, change))
+        for name, change in ALTERED.items()
+    },
     "end of a log": ("classes", lambda run: (run.path / commit_of("classes", 3)).unlink()),
     "end of the last log": ("episodes", lambda run: (run.path / commit_of("episodes", 3)).unlink()),
     "no table": ("evaluation_frames", lambda run: shutil.rmtree(run.tables / "evaluation_frames")),

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
+import re
 import shutil
 from collections.abc import Callable
 from pathlib import Path
 
 import pytest
 import synthetic
-from damages import flip
+from damages import ALTERED, alter, flip
 from deltalake import DeltaTable
 from run_digest import digests
 
@@ -95,22 +96,30 @@ def of_fewer_commits(run: Run) -> None:
     shutil.copy(checkpoints.kept(other / "_delta_log")[-1], newest(run, "frames"))
 
 
-DAMAGES: dict[str, Callable[[Run], object]] = {
-    "half of it": lambda run: os.truncate(newest(run, "frames"), 400),
-    "nothing of it": lambda run: os.truncate(newest(run, "frames"), 0),
-    "one of fewer commits": of_fewer_commits,
+UNREADABLE, CONTRADICTED = r"one cannot be read \(.+\), and the log has all commits", "they contradict the commits"
+DAMAGES: dict[str, tuple[Callable[[Run], object], str, bool]] = {
+    "half of it": (lambda run: os.truncate(newest(run, "frames"), 400), UNREADABLE, False),
+    "nothing of it": (lambda run: os.truncate(newest(run, "frames"), 0), UNREADABLE, False),
+    "one of fewer commits": (of_fewer_commits, f"{CONTRADICTED}, which fit the files", False),
+    **{
+        f"a commit's {name}": (lambda run, change=change: alter(run, "frames", 4, change), CONTRADICTED, True)
+        for name, change in ALTERED.items()
+    },
 }
+"""What each does, what is said of the checkpoint, and whether the log is built anew: it is where commits are wrong."""
 
 
 @pytest.mark.parametrize("damage", DAMAGES)
-def test_a_damaged_checkpoint_is_found_and_set_aside_with_nothing_lost(run: Run, damage: str) -> None:
-    before = digests(run.path)
-    DAMAGES[damage](run)
+def test_a_checkpoint_that_is_damaged_or_contradicted_is_set_aside_with_nothing_lost(run: Run, damage: str) -> None:
+    before, (plant, why, anew) = digests(run.path), DAMAGES[damage]
+    plant(run)
     place = newest(run, "frames").relative_to(run.path)
     assert {(fault.part, fault.place) for fault in verify(run) if fault.part == "frames"} == {("frames", str(place))}
     done = repair(run, None, verify)
     assert (done.left, verify(run), digests(run.path)) == ([], [], before)
-    assert done.sentences == [f"checkpoints of {place.parent} are set aside in damaged/: the commits say the same"]
+    said, *more = done.sentences
+    assert re.fullmatch(f"checkpoints of {place.parent} are set aside in damaged/: {why}", said)
+    assert more == ([f"{place.parent} is built anew from {ITERATIONS_N} files"] if anew else [])
     assert (run.path / "damaged" / place).exists()
     synthetic.commit(run, ITERATIONS_N)
     assert verify(run) == []

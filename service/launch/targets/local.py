@@ -13,10 +13,9 @@ from collections.abc import Sequence
 from contextlib import suppress
 from pathlib import Path
 
-from t6gps.service.config import Config
 from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.job import Job, JobState, outcome
-from t6gps.service.launch.targets.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher, check_publishing
 from t6gps.service.ray_backend import processes
 from t6gps.storage.errors import RunError
 
@@ -24,8 +23,8 @@ from t6gps.storage.errors import RunError
 class LocalLauncher(VisibleLauncher):
     """The launcher of this machine. A job's number is HOST:PID:START, so that no later process is taken for it."""
 
-    def check(self, config: Config) -> None:
-        """Nothing can be wrong here that the run would not say."""
+    def check(self, planned: Sequence[Planned]) -> None:
+        check_publishing(planned)  # the run says what else is wrong
 
     def render(self, planned: Sequence[Planned]) -> str:
         folders = [job.folder for job in planned]

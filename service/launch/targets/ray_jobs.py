@@ -30,6 +30,7 @@ from t6gps.service.ray_backend import jobs_api
 from t6gps.service.ray_backend.errands import Node, Survey
 from t6gps.service.ray_backend.jobs_api import JobsApi
 from t6gps.service.steering.status import Status
+from t6gps.service.training import publishing
 from t6gps.storage.errors import ConfigError, RunError
 
 SAME = ("t6gps", "schema")
@@ -37,7 +38,7 @@ SAME = ("t6gps", "schema")
 Result = TypeVar("Result")
 SURVEY, REACHED = TypeAdapter(Survey), TypeAdapter(Status)
 STATUS: TypeAdapter[Status | None] = TypeAdapter(Status | None)
-PLACED, REMOVED = TypeAdapter(list[str]), TypeAdapter(None)
+PLACED, NOTHING = TypeAdapter(list[str]), TypeAdapter(None)
 """What errands bring."""
 STATES = {
     "PENDING": JobState.PENDING,
@@ -59,7 +60,8 @@ class RayLauncher(VisibleLauncher):
         """The connection, made when it is needed first."""
         return JobsApi(self.target.address)
 
-    def check(self, config: Config) -> None:
+    def check(self, planned: Sequence[Planned]) -> None:
+        publishing.address(planned[0].publish)  # the keys are those of the cluster
         self.api  # noqa: B018  connects
 
     def render(self, planned: Sequence[Planned]) -> str:
@@ -80,6 +82,8 @@ class RayLauncher(VisibleLauncher):
                 "name the cluster's own by ray.root in the file of targets"
             )
         judge(survey, config, root)
+        if planned[0].publish is not None:
+            self._errand(NOTHING, "publish", root, planned[0].publish, *(folder.run for folder in folders))
         if self.target.root is not None:
             self._place(config, folders)
         return self._started(folders)
@@ -149,7 +153,8 @@ class RayLauncher(VisibleLauncher):
         with tempfile.TemporaryDirectory() as draft:
             for folder in here:
                 (Path(draft) / folder.run).mkdir()
-                folders.write(configuration.load(str(folder.config)), self._there(folder), Path(draft) / folder.run)
+                there = Planned(configuration.load(str(folder.config)), self._there(folder), folder.publish)
+                folders.write(there, Path(draft) / folder.run)
             runs = [folder.run for folder in here]
             self._errand(PLACED, "place", str(self.target.root), "again" if again else "", *runs, folder=Path(draft))
 
@@ -165,7 +170,7 @@ class RayLauncher(VisibleLauncher):
                     self.api.stop(number)
             if self.target.root is not None:
                 with suppress(RunError):
-                    self._errand(REMOVED, "remove", self.target.root, *(folder.run for folder in here))
+                    self._errand(NOTHING, "remove", self.target.root, *(folder.run for folder in here))
             raise
         return numbers
 

@@ -14,7 +14,7 @@ from t6gps.service.config import Config
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import STOPPED, Job, JobState, outcome
 from t6gps.service.launch.target import Slurm
-from t6gps.service.launch.targets.visible import VisibleLauncher
+from t6gps.service.launch.targets.visible import VisibleLauncher, check_publishing
 from t6gps.storage.errors import ConfigError, RunError
 
 PROGRAMS = ("sbatch", "squeue", "scancel", "scontrol")
@@ -33,8 +33,9 @@ class SlurmLauncher(VisibleLauncher):
     def __init__(self, target: Slurm) -> None:
         self.target = target
 
-    def check(self, config: Config) -> None:
-        _fits(config, self.target)
+    def check(self, planned: Sequence[Planned]) -> None:
+        _fits(planned[0].config, self.target)
+        check_publishing(planned)
         for program in PROGRAMS:
             _asked(program, "--version")
         _asked("scontrol", "ping")
@@ -85,6 +86,8 @@ class SlurmLauncher(VisibleLauncher):
         log = first.log.parent.with_name(first.run.removesuffix("0") + "%a") / "log" if several else first.log
         array = [f"--array=0-{len(folders) - 1}"] if several else []
         outputs = ["--parsable", f"--output={log}", f"--chdir={first.root}"]
+        if planned[0].publish is not None:
+            outputs.append("--export=ALL")  # the keys of the object store, also where the site takes nothing along
         paths = [str(folder.path) for folder in folders]
         return [*outputs, *array, *_options(self.target), str(script), self.target.bin, *paths]
 

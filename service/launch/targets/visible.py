@@ -2,31 +2,33 @@
 
 from __future__ import annotations
 
+import logging
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
 
-from t6gps.service.config import Config
 from t6gps.service.launch.fetch import FolderSource, Source
 from t6gps.service.launch.folder import Planned
 from t6gps.service.launch.job import ENDED, Job, JobState
 from t6gps.service.launch.targets import errand
 from t6gps.service.steering import requests
 from t6gps.service.steering.status import Status
+from t6gps.service.training import publishing
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
 TICK_S = 0.2
+_log = logging.getLogger(__name__)
 
 
 class VisibleLauncher(ABC):
     """A `Launcher` whose jobs write into a root that this machine sees."""
 
     @abstractmethod
-    def check(self, config: Config) -> None: ...
+    def check(self, planned: Sequence[Planned]) -> None: ...
 
     @abstractmethod
     def render(self, planned: Sequence[Planned]) -> str: ...
@@ -67,6 +69,13 @@ class VisibleLauncher(ABC):
 
     def source(self, job: Job) -> AbstractContextManager[Source]:
         return nullcontext(FolderSource(_run(job)))
+
+
+def check_publishing(planned: Sequence[Planned]) -> None:
+    """See that jobs whose environment is that of this process can publish their runs. Errors as `check_all`."""
+    root = publishing.target(planned[0].publish)
+    if root is not None:
+        publishing.check_all([Run(job.folder.root / job.folder.run) for job in planned], root, _log.warning)
 
 
 def _run(job: Job) -> Run:

@@ -54,6 +54,31 @@ def test_kubernetes_takes_every_object(manifest: Any) -> None:
     kube_api.check(PLURALS[manifest["kind"]], manifest)
 
 
+def published() -> list[Any]:
+    target = TARGET.model_copy(update={"store_secret": "lab-keys", "store_port": 8333})
+    return manifests.job(configuration.load("flat-quick"), "flat", target, "s3://lab/runs")
+
+
+@pytest.mark.parametrize("manifest", published(), ids=lambda manifest: manifest["kind"])
+def test_kubernetes_takes_every_object_of_a_job_that_publishes(manifest: Any) -> None:
+    kube_api.check(PLURALS[manifest["kind"]], manifest)
+
+
+def test_the_head_alone_has_the_keys_of_the_store_and_a_job_without_them_is_refused() -> None:
+    config_map, policy, ray_job = published()
+    assert config_map["data"]["publish"] == "s3://lab/runs\n"
+    assert policy["spec"]["egress"][-1] == {"ports": [{"protocol": "TCP", "port": 8333}]}
+    spec = ray_spec(ray_job)
+    (head,), (worker,) = (
+        group["template"]["spec"]["containers"] for group in (spec["headGroupSpec"], *spec["workerGroupSpecs"])
+    )
+    assert head["envFrom"] == [{"secretRef": {"name": "lab-keys"}}]
+    assert "envFrom" not in worker
+    assert len(job()[1]["spec"]["egress"]) == len(policy["spec"]["egress"]) - 1
+    with pytest.raises(ConfigError, match=r"k8s\.store_secret names none; make a Secret"):
+        manifests.job(configuration.load("flat-quick"), "flat", TARGET, "s3://lab/runs")
+
+
 PLANTED = [
     ("RayJob", lambda spec: spec["rayClusterSpec"]["headGroupSpec"]["template"]["spec"]["containers"][0].pop("name")),
     ("RayJob", lambda spec: spec["rayClusterSpec"]["workerGroupSpecs"][0]["template"]["spec"].update(hostNetwrok=True)),

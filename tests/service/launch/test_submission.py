@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import json
+import os
 import socket
+import subprocess
 from pathlib import Path
 
 import numpy as np
@@ -15,7 +17,7 @@ from t6gps.service.launch import folder as folders
 from t6gps.service.launch import job as records
 from t6gps.service.launch import submission
 from t6gps.service.launch import target as targets
-from t6gps.service.launch.folder import Folder
+from t6gps.service.launch.folder import Folder, Planned
 from t6gps.service.launch.target import Kind, Local, Slurm
 from t6gps.storage import catalog
 from t6gps.storage.errors import ConfigError, RunError
@@ -136,7 +138,7 @@ def test_a_job_has_its_ground_and_configuration_in_the_root(tmp_path: Path) -> N
     source = tmp_path / "hill.npy"
     np.save(source, np.linspace(0, 1, 81 * 81).reshape(81, 81))
     planned = submission.plan("flat-quick", [f"terrain.file={source}"], tmp_path / "runs", "a", None, False)[0]
-    with folders.prepared(planned.config, planned.folder):
+    with folders.prepared(planned):
         source.unlink()
     copy = planned.folder.path / "ground" / "hill.npy"
     assert configuration.load(str(planned.folder.config)).terrain.file == str(copy)
@@ -148,19 +150,69 @@ def test_a_folder_that_is_written_for_another_root_has_its_ground_there(tmp_path
     np.save(source, np.linspace(0, 1, 81 * 81).reshape(81, 81))
     config = configuration.load("flat-quick", [f"terrain.file={source}"])
     (tmp_path / "draft").mkdir()
-    folders.write(config, Folder(Path("/mnt/runs/.jobs/a")), tmp_path / "draft")
+    folders.write(Planned(config, Folder(Path("/mnt/runs/.jobs/a"))), tmp_path / "draft")
     assert (tmp_path / "draft" / "ground" / "hill.npy").read_bytes() == source.read_bytes()
     written = configuration.load(str(tmp_path / "draft" / "config.toml"))
     assert written.terrain.file == "/mnt/runs/.jobs/a/ground/hill.npy"
 
 
+@pytest.mark.parametrize("publish", [None, "s3://lab/runs"])
+def test_the_script_of_a_job_publishes_where_its_folder_says_so(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, publish: str | None
+) -> None:
+    program = tmp_path / "bin" / "t6gps"
+    program.parent.mkdir()
+    program.write_text(f'#!/bin/sh\nprintf "%s\\n" "$@" > {tmp_path}/said\n')
+    program.chmod(0o755)
+    monkeypatch.setenv("PATH", f"{program.parent}:{os.environ['PATH']}")
+    planned = submission.plan("flat-quick", [], tmp_path / "a root", "a", None, False, publish)[0]
+    with folders.prepared(planned):
+        assert planned.folder.publish == publish
+    assert subprocess.run(["bash", "-u", planned.folder.script, planned.folder.path], check=False).returncode == 0
+    said = (tmp_path / "said").read_text().splitlines()
+    expected = ["train", str(planned.folder.config), "--run", "a", "--root", str(tmp_path / "a root"), "--resume"]
+    assert said == expected + ([] if publish is None else ["--publish", publish])
+
+
+def test_a_run_that_is_continued_is_published_as_before(tmp_path: Path) -> None:
+    config = configuration.load("flat-quick")
+    run = catalog.create(tmp_path, "a", config.to_json())
+    assert submission.continuing(run, config).publish is None
+    with folders.prepared(Planned(config, folders.of(tmp_path, "a"), "s3://lab/runs")):
+        pass
+    assert submission.continuing(run, config).publish == "s3://lab/runs"
+
+
+@pytest.mark.parametrize(
+    ("address", "sentence"),
+    [("elsewhere", "--publish takes s3://BUCKET/PREFIX, found 'elsewhere'"), ("s3://lab/runs", "s3:// needs the keys")],
+)
+def test_a_job_that_could_not_publish_is_not_submitted(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, address: str, sentence: str
+) -> None:
+    monkeypatch.delenv("AWS_ACCESS_KEY_ID", raising=False)
+    done = t6gps("submit", "flat-quick", "--root", tmp_path / "runs", "--publish", address, code=2)
+    assert sentence in done.stderr
+    assert len(done.stderr.splitlines()) == 1
+    assert not (tmp_path / "runs").exists()
+    assert not records.jobs()
+
+
+def test_a_job_of_slurm_takes_the_keys_along_where_it_publishes(tmp_path: Path) -> None:
+    options = ("submit", "flat-quick", "--to", "slurm", "--root", tmp_path, "--dry-run")
+    assert "--export=ALL" not in t6gps(*options).stdout.decode().partition("#!")[0]
+    said = t6gps(*options, "--publish", "s3://lab/runs").stdout.decode().partition("#!")[0]
+    assert "--export=ALL" in said and "# each run is published below s3://lab/runs" in said
+
+
 def test_a_submission_that_fails_puts_the_earlier_folder_back(tmp_path: Path) -> None:
-    config, folder = configuration.load("flat-quick"), folders.of(tmp_path, "a")
-    with folders.prepared(config, folder):
+    planned = Planned(configuration.load("flat-quick"), folders.of(tmp_path, "a"))
+    folder = planned.folder
+    with folders.prepared(planned):
         pass
     folder.log.write_text("what the first job wrote\n")
     before = entries(tmp_path)
-    with pytest.raises(RunError, match="refused"), folders.prepared(config, folder):
+    with pytest.raises(RunError, match="refused"), folders.prepared(planned):
         assert folder.log.read_text() == "what the first job wrote\n"
         raise RunError("refused")
     assert entries(tmp_path) == before
@@ -169,7 +221,7 @@ def test_a_submission_that_fails_puts_the_earlier_folder_back(tmp_path: Path) ->
 def test_names_that_are_taken_are_refused_or_numbered(tmp_path: Path) -> None:
     config = configuration.load("flat-quick")
     catalog.create(tmp_path, "flat-quick", config.to_json())
-    with folders.prepared(config, folders.of(tmp_path, "flat-quick-2")):
+    with folders.prepared(Planned(config, folders.of(tmp_path, "flat-quick-2"))):
         pass
     assert submission.plan("flat-quick", [], tmp_path, None, None, False)[0].folder.run == "flat-quick-3"
     for name in ("flat-quick", "flat-quick-2"):

@@ -4,12 +4,14 @@ from __future__ import annotations
 
 from pathlib import Path
 
+import obstore
 import pytest
 
 from t6gps.service.ray_backend import errands
 from t6gps.service.ray_backend.jobs_api import RESULT, last_words
 from t6gps.storage import catalog
-from t6gps.storage.errors import RunError
+from t6gps.storage.errors import ConfigError, RunError, StoreError
+from t6gps.storage.objects.place import ObjectPath
 
 
 @pytest.fixture
@@ -49,6 +51,21 @@ def test_a_job_that_is_submitted_again_takes_the_place_of_its_earlier_folder(roo
 def test_a_root_that_cannot_hold_runs_is_refused_before_ray_is_joined() -> None:
     with pytest.raises(RunError, match=r"root: /proc: .*; needed: a writable folder"):
         errands.look("/proc/runs", "")
+
+
+def test_the_head_tries_its_keys_and_the_store_and_looks_for_other_runs(
+    root: Path, objects: ObjectPath, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    errands.publish(str(root), str(objects), "a", "b")
+    assert objects.below() == {}
+    obstore.put(objects.client(), (objects / "b" / "config.json").key, b"of another")
+    with pytest.raises(RunError, match=r"/b holds another run of that name"):
+        errands.publish(str(root), str(objects), "a", "b")
+    with pytest.raises(StoreError, match="there is no bucket 'nowhere'"):
+        errands.publish(str(root), "s3://nowhere", "a")
+    monkeypatch.delenv("AWS_SECRET_ACCESS_KEY")
+    with pytest.raises(ConfigError, match="needs the keys of the object store; set AWS_SECRET_ACCESS_KEY"):
+        errands.publish(str(root), str(objects), "a")
 
 
 def test_an_errand_says_its_result_or_its_error_in_one_line(root: Path, capsys: pytest.CaptureFixture[str]) -> None:

@@ -10,44 +10,26 @@ import numpy as np
 import pyarrow as pa
 import pytest
 from numpy.typing import NDArray
+from rough_walk import walked
 
 from t6gps.service import config as configuration
 from t6gps.service.views import replay
 from t6gps.service.views.replay import Replay
-from t6gps.storage import catalog, schema
+from t6gps.storage import catalog
 from t6gps.storage.errors import DataError
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode
 from t6gps.storage.spool import Spool
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.pictures.motion import of_episode
 from t6gps.workers.pictures.stays import stuck
-from t6gps.workers.robot.neutral import nominal_rest_length
-from t6gps.workers.robot.topology import CABLES_N
-from t6gps.workers.worker import RolloutWorker
 
 CONFIG = configuration.load("rough-quick", ["task.waypoint_timeout_s=1.5"])
-PLAN = EpisodePlan(
-    episode_id=7,
-    iteration=0,
-    index=7,
-    seed=123,
-    steps=60,
-    terrain_seed=5,
-    terrain_difficulty=0.7,
-    noise_std_m=0.15,
-    policy_version=0,
-)
 
 
 @pytest.fixture(scope="module")
 def episode() -> Episode:
     """A real one on rough ground, with another waypoint every 1.5 s."""
-    layer = (np.zeros((CABLES_N, schema.OBSERVATION_N), np.float32), np.zeros(CABLES_N, np.float32))
-    worker = RolloutWorker(CONFIG.rollout)
-    try:
-        return worker.run(PLAN, PolicySnapshot(0, (layer,), nominal_rest_length(CONFIG.robot), 0.2))
-    finally:
-        worker.close()
+    return walked(CONFIG.rollout)
 
 
 @pytest.fixture(scope="module")

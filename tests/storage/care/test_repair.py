@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
-from damages import DAMAGES
+from damages import ALTERED, DAMAGES, alter
 
 from t6gps.storage import catalog, checkpoint, schema, tables
 from t6gps.storage.care.repair import repair
@@ -46,6 +46,16 @@ def test_a_log_is_built_anew_from_its_files_and_the_old_one_kept(worked: Run) ->
     assert (done.left, verify(worked)) == ([], [])
     assert {name: tables.read(worked, name) for name in schema.TABLES} == rows
     assert (worked.path / "damaged" / torn.relative_to(worked.path)).stat().st_size == 60
+
+
+@pytest.mark.parametrize("name", ALTERED)
+def test_a_commit_that_was_altered_costs_nothing_where_its_file_is_as_it_was(worked: Run, name: str) -> None:
+    rows = {name: tables.read(worked, name) for name in schema.TABLES}
+    alter(worked, "models" if name != "range" else "episodes", 1, ALTERED[name])
+    done = repair(worked, None, verify)
+    assert [sentence.split("/")[-1] for sentence in done.sentences] == ["_delta_log is built anew from 3 files"]
+    assert (done.left, verify(worked)) == ([], [])
+    assert {name: tables.read(worked, name) for name in schema.TABLES} == rows
 
 
 def test_what_cannot_be_mended_is_set_aside_and_comes_again(worked: Run, iterate: Any, evaluate: Any) -> None:
@@ -88,7 +98,27 @@ def test_torn_states_and_episodes_are_set_aside(worked: Run, make_episode: Any) 
         "checkpoints/iteration-000003",
         "spool/iteration-000003/episode-000000000300.arrow",
     ]
+    assert [sentence.split("damaged/: ")[1] for sentence in done.sentences] == [
+        "checkpoints/iteration-000002 serves when the run is resumed",
+        "its episode is sampled again when the run is resumed",
+    ]
     assert verify(worked) == []
+
+
+def test_what_is_said_of_what_is_set_aside_is_so(worked: Run, make_episode: Any) -> None:
+    Spool(worked.spool, 1).append(make_episode(100, 1))
+    os.truncate(Spool(worked.spool, 1).path(100), 99)
+    assert repair(worked, None, verify).sentences == [
+        "spool/iteration-000001/episode-000000000100.arrow is set aside in damaged/: "
+        "its iteration is finished, and nothing needs it"
+    ]
+    for state in checkpoint.kept(worked.checkpoints).values():
+        (state / "DONE").unlink()
+    done = repair(worked, None, verify)
+    assert checkpoint.load_latest(worked.checkpoints) is None
+    assert {sentence.split("damaged/: ")[1] for sentence in done.sentences} == {
+        "there is no other one, so that a run that is resumed begins anew, to the same bytes"
+    }
 
 
 def test_a_sound_run_a_run_in_use_and_the_copy_of_another_are_left_as_they_are(worked: Run, tmp_path: Path) -> None:

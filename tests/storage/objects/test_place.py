@@ -4,14 +4,19 @@ import io
 import os
 import pickle
 import shutil
+import socket
 import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from pathlib import Path
 
 import obstore
 import pytest
 
 from t6gps.storage import catalog, durable
+from t6gps.storage.catalog import Run
+from t6gps.storage.delta import log
 from t6gps.storage.errors import ConfigError, RunError, StoreError, StoreUnreachableError
 from t6gps.storage.objects import place
 from t6gps.storage.objects.place import ObjectPath
@@ -144,3 +149,25 @@ def test_the_extra_is_named_where_it_is_not_installed(objects: ObjectPath, monke
     monkeypatch.setitem(sys.modules, "obstore", None)
     with pytest.raises(ConfigError, match=r"install it with: pip install 't6gps\[s3\]'"):
         catalog.list_runs(Path(str(objects)))
+
+
+def test_other_threads_go_on_while_a_store_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        for name, value in (
+            ("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.getsockname()[1]}"),
+            ("AWS_ACCESS_KEY_ID", "key"),
+            ("AWS_SECRET_ACCESS_KEY", "secret"),
+        ):
+            monkeypatch.setenv(name, value)
+        run = Run(place.whole(Path("s3://lab/runs/rough")))
+        with ThreadPoolExecutor(1) as pool:
+            opened = pool.submit(log.opened, run, "frames")
+            connection, _ = server.accept()  # this thread goes on, and nobody has answered
+            assert not opened.done()
+            server.settimeout(0.2)
+            while not opened.done():  # every try is hung up on
+                connection.close()
+                with suppress(TimeoutError):
+                    connection, _ = server.accept()
+            with pytest.raises(StoreUnreachableError, match="does not answer for the bucket 'lab'"):
+                opened.result()

@@ -10,7 +10,6 @@ from contextlib import AbstractContextManager, contextmanager, nullcontext
 
 from pydantic import JsonValue, TypeAdapter
 
-from t6gps.service.config import Config
 from t6gps.service.launch import job as records
 from t6gps.service.launch.fetch import Source
 from t6gps.service.launch.folder import Planned
@@ -21,6 +20,7 @@ from t6gps.service.launch.targets.kubernetes.claim import ClaimSource, Place
 from t6gps.service.launch.targets.kubernetes.kubectl import Kubectl, at
 from t6gps.service.launch.targets.kubernetes.pods import Manifest
 from t6gps.service.steering.status import Status
+from t6gps.service.training import publishing
 from t6gps.storage.errors import ConfigError, RunError
 
 TICK_S, PATIENCE_S, GONE_S = 1.0, 120.0, 120.0
@@ -40,8 +40,9 @@ class KubernetesLauncher:
         self.target = target
         self.kubectl = Kubectl(target.context, target.namespace)
 
-    def check(self, config: Config) -> None:
-        objects = manifests.job(config, NOBODY, self.target)
+    def check(self, planned: Sequence[Planned]) -> None:
+        publishing.address(planned[0].publish)  # the keys are in the cluster
+        objects = manifests.job(planned[0].config, NOBODY, self.target, planned[0].publish)
         self._check_claim()
         for manifest in objects:
             self.kubectl.create(manifest, dry_run=True)
@@ -135,7 +136,7 @@ class KubernetesLauncher:
             yield ClaimSource(place, job.run)
 
     def _objects(self, job: Planned) -> list[Manifest]:
-        return manifests.job(job.config, job.folder.run, self.target)
+        return manifests.job(job.config, job.folder.run, self.target, job.publish)
 
     def _make_way(self, job: Planned) -> None:
         """Remove the objects of this desk's earlier job of that run. RunError where that has not ended."""

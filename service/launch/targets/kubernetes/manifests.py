@@ -17,6 +17,7 @@ import yaml
 
 from t6gps.service import config as configuration
 from t6gps.service.config import Config
+from t6gps.service.launch.folder import PUBLISH
 from t6gps.service.launch.target import K8s
 from t6gps.service.launch.targets.kubernetes import pods
 from t6gps.service.launch.targets.kubernetes.pods import JOB, ROOT, Manifest, Size
@@ -46,10 +47,23 @@ def labels(instance: str) -> dict[str, str]:
     return {LABEL: instance}
 
 
-def job(config: Config, run: str, target: K8s) -> list[Manifest]:
-    """The objects of a job, the RayJob last. ConfigError for a run that does not fit, TerrainError for its ground."""
+def job(config: Config, run: str, target: K8s, publish: str | None = None) -> list[Manifest]:
+    """The objects of a job, the RayJob last. ConfigError for a run that does not fit, TerrainError for its ground.
+
+    publish   root in an object store that gets a copy of the run; ConfigError where the target has no keys for it
+    """
     instance = name(run, target)
-    return [_config_map(config, run, instance), _network_policy(instance), _ray_job(config, run, instance, target)]
+    if publish is not None and target.store_secret is None:
+        raise ConfigError(
+            "--publish needs the keys of the object store in the cluster, and k8s.store_secret names none; make a "
+            "Secret with AWS_ACCESS_KEY_ID and so on, and name it in the file of targets"
+        )
+    port = None if publish is None else target.store_port
+    return [
+        _config_map(config, run, instance, publish),
+        _network_policy(instance, port),
+        _ray_job(config, run, instance, target, publish is not None),
+    ]
 
 
 def cluster(instance: str, pods_n: int, target: K8s) -> list[Manifest]:
@@ -107,8 +121,8 @@ def _metadata(instance: str) -> Manifest:
     return {"name": instance, "labels": labels(instance)}
 
 
-def _config_map(config: Config, run: str, instance: str) -> Manifest:
-    """What the head needs: configuration, ground, scripts."""
+def _config_map(config: Config, run: str, instance: str, publish: str | None) -> Manifest:
+    """What the head needs: configuration, ground, scripts, where to publish."""
     ground = config.terrain.file
     binary: dict[str, str] = {}
     if ground is not None:
@@ -132,7 +146,11 @@ def _config_map(config: Config, run: str, instance: str) -> Manifest:
         "apiVersion": "v1",
         "kind": "ConfigMap",
         "metadata": _metadata(instance),
-        "data": {"config.toml": config.to_toml(), **scripts},
+        "data": {
+            "config.toml": config.to_toml(),
+            **scripts,
+            **({} if publish is None else {PUBLISH: f"{publish}\n"}),
+        },
         **({"binaryData": binary} if binary else {}),
     }
 
@@ -141,8 +159,11 @@ def _shipped(path: str) -> Path:
     return Path(str(resources.files("t6gps.deploy") / path))
 
 
-def _network_policy(instance: str) -> Manifest:
-    """The job's pods reach each other and ask for names; KubeRay reaches their dashboard; nobody else does either."""
+def _network_policy(instance: str, store_port: int | None = None) -> Manifest:
+    """The job's pods reach each other and ask for names; KubeRay reaches their dashboard; nobody else does either.
+
+    store_port   of an object store, anywhere, that they reach, too
+    """
     own = {"podSelector": {"matchLabels": labels(instance)}}
     names = [{"protocol": protocol, "port": DNS_PORT} for protocol in ("UDP", "TCP")]
     operator = {"namespaceSelector": {}, "podSelector": {"matchLabels": OPERATOR}}
@@ -157,12 +178,16 @@ def _network_policy(instance: str) -> Manifest:
                 {"from": [own]},
                 {"from": [operator], "ports": [{"protocol": "TCP", "port": DASHBOARD_PORT}]},
             ],
-            "egress": [{"to": [own]}, {"to": [{"namespaceSelector": {}}], "ports": names}],
+            "egress": [
+                {"to": [own]},
+                {"to": [{"namespaceSelector": {}}], "ports": names},
+                *([] if store_port is None else [{"ports": [{"protocol": "TCP", "port": store_port}]}]),
+            ],
         },
     }
 
 
-def _ray_job(config: Config, run: str, instance: str, target: K8s) -> Manifest:
+def _ray_job(config: Config, run: str, instance: str, target: K8s, published: bool) -> Manifest:
     workers_n = max(config.run.workers, *(config.run.autoscale or (0,)))
     pods_n = pods_for(workers_n, config.run.cpus_per_worker, target)
     mounts: list[Manifest] = [{"name": "job", "mountPath": JOB, "readOnly": True}]
@@ -177,15 +202,26 @@ def _ray_job(config: Config, run: str, instance: str, target: K8s) -> Manifest:
             "entrypoint": f"bash {JOB}/start.sh {run}",
             "backoffLimit": target.retries,
             "shutdownAfterJobFinishes": True,
-            "rayClusterSpec": _cluster_spec(instance, pods_n, target, mounts, volumes),
+            "rayClusterSpec": _cluster_spec(instance, pods_n, target, mounts, volumes, published),
         },
     }
 
 
-def _cluster_spec(instance: str, pods_n: int, target: K8s, mounts: list[Manifest], volumes: list[Manifest]) -> Manifest:
-    """A Ray cluster whose processes know its token, with `mounts` of `volumes` on its head."""
+def _cluster_spec(
+    instance: str,
+    pods_n: int,
+    target: K8s,
+    mounts: list[Manifest],
+    volumes: list[Manifest],
+    published: bool = False,
+) -> Manifest:
+    """A Ray cluster whose processes know its token, with `mounts` of `volumes` on its head.
+
+    published   the head has the keys of the object store
+    """
     head, worker = Size(target.head_cpus, target.head_memory_gb), Size(target.cpus_per_pod, target.memory_gb_per_pod)
-    head_spec = pods.spec(target, pods.ray_container(head, mounts), volumes, claim_read_only=False)
+    keys = {"envFrom": [{"secretRef": {"name": target.store_secret}}]} if published else {}
+    head_spec = pods.spec(target, {**pods.ray_container(head, mounts), **keys}, volumes, claim_read_only=False)
     return {
         "rayVersion": metadata.version("ray"),
         "authOptions": {"mode": "token"},

@@ -13,20 +13,20 @@ import pytest
 import rerun as rr
 from numpy.typing import NDArray
 from rerun.catalog import DatasetEntry
+from rough_walk import walked
 
 from t6gps.storage import fields, schema
-from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
+from t6gps.storage.records import Episode
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.pictures.motion import motion
 from t6gps.workers.pictures.viewer import colours
 from t6gps.workers.pictures.viewer.recording import recorded
 from t6gps.workers.pictures.viewer.world import World
-from t6gps.workers.robot.neutral import neutral_state, nominal_rest_length
+from t6gps.workers.robot.neutral import neutral_state
 from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.symmetry import CABLES_FROM, EDGE_NAMES, ELEMENTS_N
 from t6gps.workers.robot.topology import BAR_LENGTH_M, CABLES, CABLES_N, FACES, KIND_NAMES
 from t6gps.workers.settings import RandomisationSettings, RobotSettings, RolloutSettings, TaskSettings, TerrainSettings
-from t6gps.workers.worker import RolloutWorker
 
 Array = NDArray[np.float64]
 SETTINGS = RolloutSettings(
@@ -40,23 +40,7 @@ NAME = "walk-7"
 @pytest.fixture(scope="module")
 def episode() -> Episode:
     """A real one: rough ground, another waypoint every 1.5 s, cables of a stiffness of its own."""
-    plan = EpisodePlan(
-        episode_id=7,
-        iteration=0,
-        index=7,
-        seed=123,
-        steps=60,
-        terrain_seed=5,
-        terrain_difficulty=0.7,
-        noise_std_m=0.15,
-        policy_version=0,
-    )
-    layer = (np.zeros((CABLES_N, schema.OBSERVATION_N), np.float32), np.zeros(CABLES_N, np.float32))
-    worker = RolloutWorker(SETTINGS)
-    try:
-        return worker.run(plan, PolicySnapshot(0, (layer,), nominal_rest_length(SETTINGS.robot), 0.2))
-    finally:
-        worker.close()
+    return walked(SETTINGS)
 
 
 @pytest.fixture(scope="module")
