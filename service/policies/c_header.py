@@ -75,7 +75,7 @@ def write(policy: PolicySnapshot, robot: RobotSettings, description: Description
     }
     template = resources.files(__package__).joinpath(TEMPLATE).read_text(encoding="utf-8")
     text = re.sub(r"@(\w+)@", lambda place: str(filled[place[1]]), template)
-    file.write_text(text + SUM.format(_sum(text)), encoding="utf-8")
+    file.write_text(text + SUM.format(digest(text)), encoding="utf-8")
 
 
 def _single(value: float | np.float32) -> str:
@@ -97,7 +97,8 @@ def _lines(values: list[str]) -> str:
     return "{\n    " + ",\n    ".join(rows) + "}"
 
 
-def _sum(text: str) -> str:
+def digest(text: str) -> str:
+    """SHA-256 of a header without its last line."""
     return hashlib.sha256(text.encode()).hexdigest()
 
 
@@ -114,7 +115,7 @@ class CDriver:
         if described is None:
             raise DataError(f"{file} is no header of a policy; export one: t6gps policy export RUN --format c")
         body, mark, _ = text.rpartition(SUM.partition("{")[0])
-        if not mark or text != body + SUM.format(_sum(body)):
+        if not mark or text != body + SUM.format(digest(body)):
             raise DataError(f"{file} is truncated or altered: it fails its SHA-256; export the policy again")
         self.description = read(described[1], file)
         self._decide = _compiled(file)
