@@ -12,7 +12,7 @@ import re
 import shutil
 import subprocess
 import tempfile
-from collections.abc import Iterable
+from collections.abc import Callable, Iterable
 from importlib import resources
 from pathlib import Path
 from typing import final
@@ -35,7 +35,7 @@ DESCRIPTION = re.compile(r"^ \* t6gps-policy: (.*)$", re.MULTILINE)
 SUM = "/* sha256 of all above: {} */\n"
 LINE_N = 8
 """Numbers on a line."""
-OPTIONS = ("-std=c99", "-O2", "-shared", "-fPIC")
+OPTIONS = ("-std=c99", "-O3", "-shared", "-fPIC")
 SOURCE = (
     '#include "{}"\nvoid decide(const t6gps_measurement *m, t6gps_state *s, double *c) {{ t6gps_decide(m, s, c); }}\n'
 )
@@ -118,31 +118,30 @@ class CDriver:
         if not mark or text != body + SUM.format(digest(body)):
             raise DataError(f"{file} is truncated or altered: it fails its SHA-256; export the policy again")
         self.description = read(described[1], file)
-        self._decide = _compiled(file)
+        self._decide = compiled(file, SOURCE, "decide")
 
     def decide(self, measured: Measurement, state: State) -> tuple[Array, State]:
         """As `driver.Driver`."""
         values = np.concatenate([np.asarray(part, dtype=np.float64).ravel() for part in vars(measured).values()])
         after, commands = state.astype(np.intc), np.empty(24)
-        self._decide(*(array.ctypes.data for array in (values, after, commands)))
+        self._decide(*(array.ctypes.data_as(ctypes.c_void_p) for array in (values, after, commands)))
         return commands, after.astype(np.int64)
 
 
-def _compiled(file: Path) -> ctypes._NamedFuncPointer:
-    """The function of a header, by a compiler that is called cc or gcc."""
+def compiled(file: Path, source: str, name: str) -> Callable[..., None]:
+    """A function of a source that includes a header as `{}`, by the compiler cc or gcc; a pointer is a c_void_p."""
     compiler = shutil.which("cc") or shutil.which("gcc")
     if compiler is None:
         raise ConfigError(
             f"{file} needs a C compiler, found neither cc nor gcc; install one, or export with --format onnx"
         )
     with tempfile.TemporaryDirectory(prefix="t6gps-") as folder:
-        source, library = Path(folder, "policy.c"), Path(folder, "policy.so")
-        source.write_text(SOURCE.format(json.dumps(str(file.resolve()))[1:-1]))
+        text, library = Path(folder, "policy.c"), Path(folder, "policy.so")
+        text.write_text(source.format(json.dumps(str(file.resolve()))[1:-1]))
         done = subprocess.run(
-            [compiler, *OPTIONS, str(source), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
+            [compiler, *OPTIONS, str(text), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
         )
         if done.returncode:
             raise DataError(f"{file} does not compile: {done.stderr.strip()[:500]}; export the policy again")
-        decide = ctypes.CDLL(str(library)).decide
-    decide.argtypes, decide.restype = [ctypes.c_void_p] * 3, None
-    return decide
+        function: Callable[..., None] = getattr(ctypes.CDLL(str(library)), name)
+    return function

@@ -27,6 +27,12 @@ class Header(Protocol):
     frame_id: str
 
 
+class Stamped(Protocol):
+    """A message with a header."""
+
+    header: Header
+
+
 class Vector(Protocol):
     """geometry_msgs/Vector3 or Point."""
 
@@ -41,10 +47,9 @@ class Pose(Protocol):
     position: Vector
 
 
-class PoseArray(Protocol):
+class PoseArray(Stamped, Protocol):
     """geometry_msgs/PoseArray."""
 
-    header: Header
     poses: Sequence[Pose]
 
 
@@ -54,24 +59,21 @@ class Twist(Protocol):
     linear: Vector
 
 
-class TwistStamped(Protocol):
+class TwistStamped(Stamped, Protocol):
     """geometry_msgs/TwistStamped."""
 
-    header: Header
     twist: Twist
 
 
-class Imu(Protocol):
+class Imu(Stamped, Protocol):
     """sensor_msgs/Imu."""
 
-    header: Header
     angular_velocity: Vector
 
 
-class PointStamped(Protocol):
+class PointStamped(Stamped, Protocol):
     """geometry_msgs/PointStamped."""
 
-    header: Header
     point: Vector
 
 
@@ -94,7 +96,8 @@ def measurement(
 
     DataError for another frame, too few or too many, a cable that is missing, and a number that is not finite.
     """
-    for what, message in (("nodes", nodes), ("com", com), ("waypoint", waypoint), *(("bars", bar) for bar in bars)):
+    stamped: list[tuple[str, Stamped]] = [("nodes", nodes), ("com", com), ("waypoint", waypoint)]
+    for what, message in stamped + [("bars", bar) for bar in bars]:
         if message.header.frame_id != WORLD:
             raise DataError(f"{what}: the frame_id must be {WORLD!r}, found {message.header.frame_id!r}; transform it")
     for what, found_n, wanted_n in (("nodes", len(nodes.poses), NODES_N), ("bars", len(bars), BARS_N)):
