@@ -22,7 +22,7 @@ from t6gps.workers.robot.topology import NODES_N
 if TYPE_CHECKING:
     import torch
 
-    from t6gps.service.policies.onnx import Value
+    from t6gps.service.policies.onnx_graph import Value
 
 T = TypeVar("T", "torch.Tensor", "Value")
 FAR_M = 1e9

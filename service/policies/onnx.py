@@ -22,6 +22,7 @@ from t6gps.service.policies import tables
 from t6gps.service.policies.decision import Inputs, Network, decide
 from t6gps.service.policies.description import Description, digest, read
 from t6gps.service.policies.driver import Array, Measurement, State
+from t6gps.service.policies.onnx_graph import Graph, Value
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.workers.settings import RobotSettings
@@ -50,77 +51,13 @@ REFUSALS = (
 )
 """What the two libraries raise for a file that is no model; these classes have no base of their own."""
 DTYPES: Mapping[int, type[np.generic]] = {TensorProto.DOUBLE: np.float64, TensorProto.INT64: np.int64}
-Number = int | float
-
-
-class _Graph:
-    """Nodes and constants, each with a name of its own."""
-
-    def __init__(self) -> None:
-        self.nodes: list[onnx.NodeProto] = []
-        self.constants: dict[str, onnx.TensorProto] = {}
-
-    def node(self, kind: str, *inputs: Value, dtype: type[np.generic] | None = None, **attributes: int) -> Value:
-        """The output of a new node, of the type of its first input unless another is given."""
-        name = f"v{len(self.nodes)}"
-        node = helper.make_node(kind, [value.name for value in inputs], [name])
-        node.attribute.extend(helper.make_attribute(key, value) for key, value in attributes.items())
-        self.nodes.append(node)
-        return Value(self, name, inputs[0].dtype if dtype is None else dtype)
-
-    def constant(self, values: np.ndarray[tuple[int, ...], np.dtype[np.generic]], name: str = "") -> Value:
-        """A constant; those without a name are called after what they hold."""
-        name = name or f"{values.dtype}_{'_'.join(map(str, values.ravel().tolist()))}_{values.ndim}"
-        self.constants[name] = numpy_helper.from_array(values.copy(), name)
-        return Value(self, name, values.dtype.type)
-
-
-@final
-@dataclass(frozen=True, eq=False)
-class Value:
-    """What a node of a graph gives, or one of its constants; arithmetic adds nodes."""
-
-    graph: _Graph
-    name: str
-    dtype: type[np.generic]
-
-    def _with(self, kind: str, other: Value | Number, dtype: type[np.generic] | None = None) -> Value:
-        value = other if isinstance(other, Value) else self.graph.constant(np.array(other, self.dtype))
-        return self.graph.node(kind, self, value, dtype=dtype)
-
-    def __add__(self, other: Value | Number) -> Value:
-        return self._with("Add", other)
-
-    def __sub__(self, other: Value | Number) -> Value:
-        return self._with("Sub", other)
-
-    def __mul__(self, other: Value | Number) -> Value:
-        return self._with("Mul", other)
-
-    def __truediv__(self, other: Value | Number) -> Value:
-        return self._with("Div", other)
-
-    def __lt__(self, other: Value | Number) -> Value:
-        return self._with("Less", other, np.bool_)
-
-    def __le__(self, other: Value | Number) -> Value:
-        return self._with("LessOrEqual", other, np.bool_)
-
-    def __ge__(self, other: Value | Number) -> Value:
-        return self._with("GreaterOrEqual", other, np.bool_)
-
-    def __and__(self, other: Value) -> Value:
-        return self._with("And", other)
-
-    def __or__(self, other: Value) -> Value:
-        return self._with("Or", other)
 
 
 @dataclass(frozen=True)
 class _Ops:
     """The operations of `decision.Ops` as nodes."""
 
-    graph: _Graph
+    graph: Graph
 
     def take(self, x: Value, index: Value) -> Value:
         return self.graph.node("Gather", x, index, axis=0)
@@ -170,7 +107,7 @@ class _Ops:
 
 def write(policy: PolicySnapshot, robot: RobotSettings, description: Description, file: Path) -> None:
     """Write a policy as ONNX."""
-    graph = _Graph()
+    graph = Graph()
     table = {name: graph.constant(values, name) for name, values in {**tables.INTS, **tables.FLOATS}.items()}
     layers = [
         (graph.constant(weight, f"weight_{number}"), graph.constant(bias, f"bias_{number}"))
