@@ -63,6 +63,7 @@ def test_the_wheel_holds_every_module_preset_script_and_the_plugin(wheel: Path) 
     shipped = ("launch/train.sh", "ray/cluster.yaml", "slurm/train.sbatch", "k8s/start.sh", "grafana/t6gps.json")
     for script in (*shipped, "prometheus/prometheus.yml", "prometheus/alerts.yml"):
         assert f"t6gps/deploy/{script}" in names
+    assert "t6gps/service/policies/policy.h" in names
     for module in SETUPTOOLS["ext-modules"]:
         assert f"{module['name'].replace('.', '/')}{sysconfig.get_config_var('EXT_SUFFIX')}" in names
     assert all(name.startswith(("t6gps/", "t6gps-")) for name in names)

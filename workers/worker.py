@@ -9,7 +9,7 @@ from t6gps.storage.schema import OBSERVATION_N, SENSORS_N
 from t6gps.workers.episode import policy, streams
 from t6gps.workers.episode.randomisation import draw
 from t6gps.workers.episode.recording import Record
-from t6gps.workers.episode.rollout import rollout
+from t6gps.workers.episode.rollout import Controller, controlled, rollout
 from t6gps.workers.episode.stance import check_stance
 from t6gps.workers.episode.streams import Stream
 from t6gps.workers.physics.bullet_engine import PyBulletEngine
@@ -37,15 +37,24 @@ class RolloutWorker(Unique):
 
     def run(self, plan: EpisodePlan, snapshot: PolicySnapshot) -> Episode:
         """Run one episode. DataError if the policy does not fit the robot, PhysicsError if the start is unsound."""
-        self._record = Record()
         policy.check(snapshot, (SENSORS_N, OBSERVATION_N), CABLES_N)
+        settings, delay_steps = self._prepare(plan)
+        return rollout(self._engine, settings, plan, snapshot, delay_steps, self._record)
+
+    def drive(self, plan: EpisodePlan, control: Controller, version: int, nominal_m: float) -> Episode:
+        """Run one episode under any controller; arguments are those of `rollout.controlled`, errors those of `run`."""
+        settings, delay_steps = self._prepare(plan)
+        return controlled(self._engine, settings, plan, control, version, nominal_m, delay_steps, self._record)
+
+    def _prepare(self, plan: EpisodePlan) -> tuple[RolloutSettings, int]:
+        """The settings of an episode, whose robot the engine then has, and its control delay (control steps)."""
+        self._record = Record()
         rng = streams.generator(plan.seed, Stream.ROBOT)
         robot, delay_steps = draw(self._settings.robot, self._settings.randomisation, rng)
         if robot != self._engine.robot:
             self._engine.close()
             self._engine = self._make_engine(robot)
-        settings = self._settings.model_copy(update={"robot": robot})
-        return rollout(self._engine, settings, plan, snapshot, delay_steps, self._record)
+        return self._settings.model_copy(update={"robot": robot}), delay_steps
 
     def position(self) -> tuple[int, list[dict[str, object]]]:
         """Control step of the newest episode, and its last states: where it stands, or where it failed."""

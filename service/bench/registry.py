@@ -16,6 +16,7 @@ from t6gps.storage.errors import ConfigError
 BENCHMARKS = {
     "learner": "t6gps.service.bench.learner",
     "physics": "t6gps.workers.bench.physics",
+    "policy": "t6gps.service.policies.speed",
     "pool": "t6gps.service.bench.pool",
     "scale": "t6gps.service.bench.scale",
     "server": "t6gps.service.bench.server",

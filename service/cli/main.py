@@ -20,7 +20,7 @@ import typer
 from t6gps.service import advice, logs
 from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
-from t6gps.service.cli import doctor, door, launching, live, serving
+from t6gps.service.cli import doctor, door, launching, live, policy, serving
 from t6gps.service.cli.data import asking, care, export, figures, listing, pictures
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
@@ -236,6 +236,7 @@ for commands in (listing, asking, pictures, figures, export, care):
 live.add_to(app)
 launching.add_to(app)
 serving.add_to(app)
+policy.add_to(app)
 doctor.add_to(app)
 
 

@@ -159,6 +159,14 @@ def film(
         writer.close()
 
 
+def check_place(out: Path) -> None:
+    """ConfigError for a file of another suffix than those of films and pictures, or in a folder that is missing."""
+    if out.suffix not in (".png", ".mp4"):
+        raise ConfigError(f"cannot write {out}: found the suffix '{out.suffix}'; allowed: .png (picture), .mp4 (film)")
+    if not out.parent.is_dir():
+        raise ConfigError(f"cannot write {out}: there is no folder {out.parent}; create it, or choose another")
+
+
 def render(
     frames: pa.Table,
     terrain: Terrain | None,
@@ -176,10 +184,7 @@ def render(
     or options that do not go together.
     """
     rows = frames.num_rows
-    if out.suffix not in (".png", ".mp4"):
-        raise ConfigError(f"cannot write {out}: found the suffix '{out.suffix}'; allowed: .png (picture), .mp4 (film)")
-    if not out.parent.is_dir():
-        raise ConfigError(f"cannot write {out}: there is no folder {out.parent}; create it, or choose another")
+    check_place(out)
     if (step is not None) + (strip is not None) + (out.suffix == ".mp4") > 1:
         raise ConfigError(f"{out}: a film, one step and a strip exclude each other; give --step or --strip, with .png")
     if strip is not None and not 1 <= strip <= rows:

@@ -74,17 +74,26 @@ def exit_edge(frame: SupportFrame, next_face: int) -> int | None:
 
 def enter(face: int, previous: SupportFrame | None, state: RobotState) -> SupportFrame:
     """Frame of a support triangle that has just been entered from `previous` (None at the start of an episode)."""
-    kind = int(FACE_KINDS[face])
-    left = None if previous is None else shared_edge(previous.face, face)
-    edge = None if left is None or previous is None else int(NEIGHBOR_EDGE[previous.face, left])
-    if previous is None or edge is None:
-        reference = _nearest_edge(face, state.nodes(), state.com)
-    elif kind == LAMBDA and edge == 0:
-        reference = _meeting_edge(face, previous)
-    else:
-        reference = edge
-    element = int(ELEMENT_BY_EDGE[face, reference])
-    return SupportFrame(face, kind, element, None if edge is None else int(EDGE_MAP[element, face, edge]))
+    edge = None if previous is None else _entry_edge(face, previous)
+    known = None if previous is None else known_element(face, previous)
+    if known is None:
+        known = int(ELEMENT_BY_EDGE[face, _nearest_edge(face, state.nodes(), state.com)])
+    return SupportFrame(face, int(FACE_KINDS[face]), known, None if edge is None else int(EDGE_MAP[known, face, edge]))
+
+
+def known_element(face: int, previous: SupportFrame) -> int | None:
+    """Element of the frame of `face` after `previous`, another triangle; None where they are not adjacent."""
+    edge = _entry_edge(face, previous)
+    if edge is None:
+        return None
+    virtual = FACE_KINDS[face] == LAMBDA and edge == 0
+    return int(ELEMENT_BY_EDGE[face, _meeting_edge(face, previous) if virtual else edge])
+
+
+def _entry_edge(face: int, previous: SupportFrame) -> int | None:
+    """Edge of `face` behind which `previous` lies, None if they are not adjacent."""
+    left = shared_edge(previous.face, face)
+    return None if left is None else int(NEIGHBOR_EDGE[previous.face, left])
 
 
 def _meeting_edge(face: int, previous: SupportFrame) -> int:

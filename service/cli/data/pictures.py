@@ -43,18 +43,23 @@ def render(
     strip: Annotated[int | None, typer.Option(min=1, help="Snapshots in a strip.")] = None,
 ) -> None:
     """Draw a stored episode from its recorded states: a still, a strip of snapshots, or a film."""
-    from t6gps.workers.pictures import render as rendering
-    from t6gps.workers.pictures.scene import Sizes
-
     with door.opened(root, server) as there, there.at_hand(run_name) as run:
         config = _world(there, run, evaluation_id)
         stored = there.episode(run_name, episode, evaluation_id)
         session.tell_changes(run, terminal.warn)
-        terrain = _ground(config, stored)
-        sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
-        with terminal.task("rendering") as progress:
-            rendering.render(stored.frames, terrain, out, sizes, step=step, strip=strip, progress=progress)
+        draw(config, stored, out, step, strip)
     typer.echo(out)
+
+
+def draw(config: Config, episode: Episode, out: Path, step: int | None = None, strip: int | None = None) -> None:
+    """Draw an episode that was run in the world of a configuration. ConfigError as for `workers.pictures.render`."""
+    from t6gps.workers.pictures import render as rendering
+    from t6gps.workers.pictures.scene import Sizes
+
+    sizes = Sizes(config.robot.bar_radius_m, config.task.waypoint_radius_m, config.robot.attachment_span_m)
+    with terminal.task("rendering") as progress:
+        ground = _ground(config, episode)
+        rendering.render(episode.frames, ground, out, sizes, step=step, strip=strip, progress=progress)
 
 
 def view(

@@ -37,6 +37,7 @@ HERE_ALONE = {
     "doctor": "looks at this machine",
     "export": "writes files of this machine, of runs that fetch brings",
     "mv": "moves folders of this machine",
+    "policy": "runs a file of this machine; its export takes a server",
     "repair": "changes folders of this machine, by copies that it sees",
     "schema": "needs no run",
     "replay": "takes a file of this machine, which fetch brings",
@@ -178,9 +179,11 @@ def test_pictures_and_runs_come_home_with_the_same_bytes(
     for name, where in (("here", ["--root", str(root)]), ("far", ["--server", url])):
         t6gps("render", "tiny", "1", "--step", "3", "--out", tmp_path / f"{name}.png", *where)
         t6gps("view", "tiny", "--pick", "best:2", "--evaluation", "0", "--out", tmp_path / f"{name}-rrd", *where)
+        t6gps("policy", "export", "tiny", "--format", "c", "--out", tmp_path / f"{name}.h", *where)
         t6gps("fetch", "tiny", "--to", tmp_path / name, *where)
         assert run_digest.digests(tmp_path / name / "tiny") == tiny.digests
     assert (tmp_path / "here.png").read_bytes() == (tmp_path / "far.png").read_bytes()
+    assert (tmp_path / "here.h").read_bytes() == (tmp_path / "far.h").read_bytes()
     here, far = ({path.name for path in (tmp_path / f"{name}-rrd").iterdir()} for name in ("here", "far"))
     assert here == far == {"tiny-evaluation-0-0.rrd", "tiny-evaluation-0-1.rrd"}
 
