@@ -5,6 +5,8 @@ import io
 import json
 import os
 import signal
+import subprocess
+import sys
 from collections.abc import Callable
 from dataclasses import asdict
 from pathlib import Path
@@ -31,6 +33,15 @@ TINY = tiny_run.settings()
 def root(tiny: Trained) -> Path:
     """A root with one finished run named `tiny`."""
     return tiny.run.path.parent
+
+
+def test_the_command_line_loads_nothing_slow() -> None:
+    script = (
+        "import sys, t6gps.service.cli.main\n"
+        "print([name for name in ('torch', 'ray', 'matplotlib', 'sklearn') if name in sys.modules])"
+    )
+    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
+    assert found.stdout == "[]\n"
 
 
 def test_train_prints_the_learning_curve_the_files_and_what_to_try_next(tiny: Trained) -> None:
