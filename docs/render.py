@@ -21,7 +21,7 @@ A file in docs/figures is one measurement:
     columns   {"name", "digits", "unit"} each: digits after the point, and what follows each number (both may be absent)
     rows      cells: text, a number, {"mean", "sd"}, a list of numbers (one per seed), or null for what was not measured
 
-Run as a program (`make docs`), it writes the pages anew.
+Run as a program (`make docs`), it writes the pages anew, and the commands as the completion of shells reads them.
 """
 
 from __future__ import annotations
@@ -40,6 +40,8 @@ from typing import Any
 
 import yaml
 
+from t6gps.service.cli.guide import completion, described
+from t6gps.service.cli.main import app
 from t6gps.service.monitoring.metrics import METRICS
 from t6gps.service.pool.attempt import FailureKind
 from t6gps.service.pool.state import NEXT_PHASES, NEXT_STATES, Ending, RunState, WorkerPhase
@@ -188,3 +190,4 @@ def rendered(page: Path) -> str:
 if __name__ == "__main__":
     for path in pages():
         path.write_text(rendered(path), encoding="utf-8")
+    completion.FILE.write_text(described.text(app), encoding="utf-8")

@@ -21,6 +21,7 @@ from t6gps.storage.settings import Settings
 from t6gps.workers.settings import RolloutSettings
 
 if TYPE_CHECKING:
+    from pydantic.fields import FieldInfo
     from pydantic_core import ErrorDetails
 
 WORKERS_MOST_N = 10000
@@ -251,17 +252,17 @@ def _siblings(key: str) -> list[str]:
     return known or sorted({name.partition(".")[0] for name in _known_keys()})
 
 
-def _known_keys() -> list[str]:
-    return list(_keys(Config, ""))
-
-
-def _keys(section: type[BaseModel], prefix: str) -> Iterator[str]:
-    """Dotted keys of a section and of those in it."""
+def settings(section: type[BaseModel] = Config, prefix: str = "") -> Iterator[tuple[str, FieldInfo]]:
+    """Every setting of a section and of those in it: its dotted key, and what is known of it."""
     for name, field in section.model_fields.items():
         if isinstance(field.annotation, type) and issubclass(field.annotation, BaseModel):
-            yield from _keys(field.annotation, f"{prefix}{name}.")
+            yield from settings(field.annotation, f"{prefix}{name}.")
         else:
-            yield prefix + name
+            yield prefix + name, field
+
+
+def _known_keys() -> list[str]:
+    return [key for key, _ in settings()]
 
 
 def _nearest(name: str, names: Sequence[str]) -> str:

@@ -39,6 +39,10 @@ def main() -> None:
     interrupt = signal.getsignal(signal.SIGINT)
     if interrupt is signal.default_int_handler:
         signal.signal(signal.SIGINT, signal.SIG_DFL)
+    from t6gps.service.cli.guide import completion
+
+    if completion.asked():
+        completion.answer()
     from t6gps.service.cli.main import main as command_line  # it loads numpy
 
     signal.signal(signal.SIGINT, interrupt)

@@ -13,9 +13,8 @@ from pathlib import Path
 from typing import Annotated, TypeAlias, Union, get_args, get_origin
 
 import pyarrow as pa
-from pydantic import BaseModel
 
-from t6gps.service.config import Config
+from t6gps.service import config as configuration
 from t6gps.service.studies import origin as studies
 from t6gps.service.training import evaluation, origin
 from t6gps.storage import catalog
@@ -106,15 +105,11 @@ def _value(settings: Mapping[str, object], key: str) -> object:
     return value
 
 
-def _settings(section: type[BaseModel], prefix: str = "") -> Iterator[tuple[str, pa.Field]]:
+def _settings() -> Iterator[tuple[str, pa.Field]]:
     """Dotted key and column of every setting."""
-    for name, known in section.model_fields.items():
-        key, annotation = prefix + name, known.annotation
-        if isinstance(annotation, type) and issubclass(annotation, BaseModel):
-            yield from _settings(annotation, f"{key}.")
-            continue
-        kind = _kind(annotation)
-        ends = [end for end in sorted(UNITS, key=len, reverse=True) if name.endswith(end)]
+    for key, known in configuration.settings():
+        kind = _kind(known.annotation)
+        ends = [end for end in sorted(UNITS, key=len, reverse=True) if key.endswith(end)]
         number = UNITS[ends[0]] if ends else "1"
         unit = "" if kind == pa.string() else number
         yield key, scalar(key.replace(".", "_"), kind, unit, known.description or f"the setting {key}", nullable=True)
@@ -144,7 +139,7 @@ def _estimates() -> Iterator[pa.Field]:
         yield scalar(f"evaluation_{name}_standard_error", pa.float64(), unit, "its standard error", nullable=True)
 
 
-_SETTINGS = dict(_settings(Config))
+_SETTINGS = dict(_settings())
 SETTINGS = {key: column.name for key, column in _SETTINGS.items()}
 """The column of `runs` that each setting has, by its dotted key."""
 ABOUT = About(

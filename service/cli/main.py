@@ -22,6 +22,7 @@ from t6gps.service import config as configuration
 from t6gps.service.bench import registry as benchmarks
 from t6gps.service.cli import doctor, door, launching, live, policy, serving
 from t6gps.service.cli.data import asking, care, export, figures, listing, pictures
+from t6gps.service.cli.guide import completion, examples
 from t6gps.service.cli.options import (
     DEFAULT_ROOT,
     Autoscale,
@@ -45,7 +46,7 @@ from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError, T6GpsError
 
-app = typer.Typer(no_args_is_help=True, add_completion=False, pretty_exceptions_enable=False)
+app = typer.Typer(no_args_is_help=True, pretty_exceptions_enable=False)
 
 EXIT_MISTAKE, EXIT_BAD_INPUT, EXIT_INTERRUPTED = 1, 2, 130
 _log = logging.getLogger(__name__)
@@ -56,7 +57,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
     try:
         try:
             logs.begin(Speaker(logs.chosen()))
-            app(arguments)
+            app(arguments, prog_name=completion.PROGRAM)
         finally:
             sys.stdout.flush()  # a full disk is told of below
     except T6GpsError as error:
@@ -124,7 +125,7 @@ def train(
 
 @app.command()
 def study(
-    name: Annotated[str, typer.Argument(metavar="NAME", help=f"One of: {', '.join(declared.STUDIES)}.")],
+    name: Annotated[str, typer.Argument(metavar="STUDY", help=f"One of: {', '.join(declared.STUDIES)}.")],
     scale: Annotated[Scale, typer.Option(help="quick: half an hour on two cores; paper: the paper's sizes.")] = (
         Scale.QUICK
     ),
@@ -191,7 +192,7 @@ def evaluate(
 
 @app.command()
 def bench(
-    name: Annotated[str, typer.Argument(help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
+    name: Annotated[str, typer.Argument(metavar="BENCHMARK", help=f"One of: {', '.join(benchmarks.BENCHMARKS)}.")],
     run_name: Annotated[str | None, typer.Argument(metavar="[RUN]", help="surrogate: the run to judge.")] = None,
     root: Root = DEFAULT_ROOT,
     seconds: Annotated[
@@ -238,6 +239,7 @@ launching.add_to(app)
 serving.add_to(app)
 policy.add_to(app)
 doctor.add_to(app)
+examples.attach(app)
 
 
 def _exit_interrupted(command: list[str]) -> NoReturn:

@@ -15,6 +15,7 @@ from pathlib import Path
 from pydantic import BaseModel, ConfigDict, JsonValue, ValidationError
 
 from t6gps.service import logs
+from t6gps.service.launch import state
 from t6gps.service.launch.folder import Folder
 from t6gps.service.launch.target import Kind
 from t6gps.storage import catalog, durable
@@ -81,16 +82,9 @@ def last_words(folder: Folder) -> str:
     return next((logs.said(line.strip()) for line in reversed(lines) if line.strip()), "its log is empty")
 
 
-def state_folder() -> Path:
-    """The user's folder of jobs, whether it is there or not."""
-    state = os.environ.get("T6GPS_STATE")
-    base = Path(state) if state else Path(os.environ.get("XDG_STATE_HOME") or "~/.local/state").expanduser() / "t6gps"
-    return base / "jobs"
-
-
 def make_state_folder() -> None:
     """Make the user's folder of jobs when it is missing. RunError where it cannot be written."""
-    folder = state_folder()
+    folder = state.folder()
     try:
         folder.mkdir(parents=True, exist_ok=True)
         if not os.access(folder, os.W_OK | os.X_OK):
@@ -104,7 +98,7 @@ def make_state_folder() -> None:
 def new(kind: Kind, native_id: str, folder: Folder, source: str, target: BaseModel) -> Job:
     """Record a job that was submitted now, in the place of an earlier job of the same run; the record."""
     job = record(_free_name(folder), kind, native_id, folder, source, target)
-    path = state_folder() / f"{job.name}.json"
+    path = state.folder() / f"{job.name}.json"
     durable.hidden(path).write_text(job.model_dump_json(indent=2) + "\n")
     durable.publish(path)
     return job
@@ -127,7 +121,7 @@ def record(name: str, kind: Kind, native_id: str, folder: Folder, source: str, t
 def forget(jobs: Iterable[Job]) -> None:
     """Remove the records of jobs."""
     for job in jobs:
-        (state_folder() / f"{job.name}.json").unlink(missing_ok=True)
+        (state.folder() / f"{job.name}.json").unlink(missing_ok=True)
 
 
 def _free_name(folder: Folder) -> str:
@@ -146,7 +140,7 @@ def jobs() -> list[Job]:
 
 
 def _records() -> Iterator[Job]:
-    for path in state_folder().glob("[!.]*.json"):
+    for path in state.folder().glob("[!.]*.json"):
         try:
             yield Job.model_validate_json(path.read_bytes())
         except (OSError, ValidationError) as error:

@@ -6,20 +6,14 @@ import ast
 import importlib
 import json
 import re
-import shlex
 import subprocess
 import tomllib
 from collections.abc import Iterator
 from fnmatch import fnmatch
-from itertools import pairwise
 from pathlib import Path
 
-import click
+import calls
 import pytest
-import typer.main
-
-from t6gps.service.cli.main import app
-from t6gps.service.config import Config
 
 LINK = re.compile(r"\[[^\]]*\]\(([^)\s]+)\)")
 FENCE = re.compile(r"^ *```.*?^ *```", re.MULTILINE | re.DOTALL)
@@ -32,7 +26,6 @@ TESTS = re.compile(r"([\w./-]+\.py)::(\w+\*?)")
 PYTHON = re.compile(r"^ *```python\n(.*?)^ *```", re.MULTILINE | re.DOTALL)
 LAB_NOTES = "docs/lab-notes.md"
 """What was measured at which commit belongs to them alone."""
-COMMAND: click.Command = typer.main.get_command(app)
 
 
 def _slug(heading: str) -> str:
@@ -47,60 +40,9 @@ def _anchors(text: str) -> set[str]:
 def _calls(text: str) -> Iterator[list[str]]:
     """Arguments of every call of `t6gps` in blocks of commands and in code within the prose."""
     for block in CONSOLE.findall(text):
-        yield from _arguments(block)
+        yield from calls.arguments(block)
     for code in CODE.findall(FENCE.sub("", text)):
-        yield from _arguments(" ".join(code.split()))
-
-
-def _arguments(commands: str) -> Iterator[list[str]]:
-    lexer = shlex.shlex(commands.replace("\n", "\n; "), posix=True, punctuation_chars=";&|")
-    lexer.whitespace_split = True
-    call: list[str] | None = None
-    for token in lexer:
-        if set(token) <= set(";&|"):
-            if call:
-                yield call
-            call = None
-        elif call is not None:
-            call.append(token)
-        elif token == "t6gps":
-            call = []
-    if call:
-        yield call
-
-
-def _complaints(arguments: list[str]) -> list[str]:
-    """What is wrong with a call: an unknown command, option or setting."""
-    name, *rest = arguments
-    known = getattr(COMMAND, "commands", {})
-    if name.startswith("-"):
-        return []
-    if name not in known:
-        return [f"t6gps {name}: no such command"]
-    command = known[name]
-    if hasattr(command, "commands"):
-        if rest and rest[0] not in command.commands:
-            return [f"t6gps {name} {rest[0]}: no such command"]
-        if rest:
-            name, command, rest = f"{name} {rest[0]}", command.commands[rest[0]], rest[1:]
-    options = {option for parameter in command.params for option in parameter.opts} | {"--help"}
-    words = [word.strip("[]") for word in rest]
-    unknown = [
-        f"t6gps {name} {word}: no such option"
-        for word in words
-        if word[:2] == "--" and word.split("=")[0] not in options
-    ]
-    keys = [key for before, key in pairwise(words) if before == "--set" and "=" in key]
-    keys += [word.removeprefix("--set=") for word in words if word.startswith("--set=")]
-    return unknown + [
-        f"t6gps {name} --set {key}: no such setting" for key in keys if not _is_setting(key.split("=")[0])
-    ]
-
-
-def _is_setting(key: str) -> bool:
-    section, _, name = key.partition(".")
-    field = Config.model_fields.get(section)
-    return field is not None and name in getattr(field.annotation, "model_fields", {})
+        yield from calls.arguments(" ".join(code.split()))
 
 
 def _sentences(text: str) -> list[str]:
@@ -166,21 +108,21 @@ def test_every_page_and_picture_is_linked(pages: dict[str, str], repository: Pat
 
 def test_every_command_option_and_setting_on_a_page_exists(pages: dict[str, str]) -> None:
     complaints = [
-        f"{page}: {wrong}" for page, text in pages.items() for call in _calls(text) for wrong in _complaints(call)
+        f"{page}: {wrong}" for page, text in pages.items() for call in _calls(text) for wrong in calls.complaints(call)
     ]
     assert not complaints
 
 
 def test_every_command_of_a_measurement_exists(repository: Path) -> None:
     commands = [json.loads(file.read_text())["command"] or "" for file in (repository / "docs" / "figures").iterdir()]
-    calls = [call for command in commands for call in _arguments(command)]
-    assert len(calls) >= len([command for command in commands if command])
-    assert not [wrong for call in calls for wrong in _complaints(call)]
+    made = [call for command in commands for call in calls.arguments(command)]
+    assert len(made) >= len([command for command in commands if command])
+    assert not [wrong for call in made for wrong in calls.complaints(call)]
 
 
 @pytest.mark.parametrize("call", ["trian flat", "train flat --quick", "eval RUN --set terrain.steepness=1"])
 def test_a_call_of_something_unknown_is_seen(call: str) -> None:
-    assert _complaints(next(_arguments(f"t6gps {call}")))
+    assert calls.complaints(next(calls.arguments(f"t6gps {call}")))
 
 
 def test_pages_but_the_lab_notes_name_no_commits(pages: dict[str, str]) -> None:
