@@ -66,7 +66,7 @@ def test_a_policy_is_driven_by_clicks_drags_and_keys_and_raced(visit: Opened, se
     )
     if script:
         page.get_by_role("button", name="End the drive").click()
-        expect(page.get_by_role("button", name="Play")).to_be_visible()
+        expect(page.get_by_role("button", name="▶ Play")).to_be_visible()
         return
     page.locator(".drive .entrants input").fill("tiny-1")
     page.get_by_role("button", name="Race with its newest policy").click()

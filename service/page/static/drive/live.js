@@ -1,6 +1,6 @@
 // Robots of a drive as they come: the newest rows of each, in the form of an episode.
 
-const KEPT_N = 12, TRAIL_N = 900, BEHIND_S = 0.15;
+const KEPT_N = 12, TRAIL_N = 300, EVEN_N = 8, BEHIND_S = 0.15;
 export const SHADES = ["bar-a", "bar-b", "curve-2", "curve-4"];
 
 /** Robots of a scene, without a row yet. */
@@ -33,6 +33,14 @@ export function take(found, frame) {
 
 function drop(one, row, n) {
   for (const [name, width] of [["time_s", 1], ["com_m", 3], ["nodes_m", 36], ["tensions_n", 24], ["face", 1], ["kinds", 1]]) one[name].splice(row * width, n * width);
+}
+
+/** A trail without the robot's rocking: the mean of neighbours. */
+export function evened(trail) {
+  return trail.map((_, k) => {
+    const near = trail.slice(Math.max(0, k - EVEN_N), k + EVEN_N + 1);
+    return [0, 1].map((axis) => near.reduce((sum, point) => sum + point[axis], 0) / near.length);
+  });
 }
 
 /** A clock that stays a little behind the newest row, so that the next one is there before it is needed. */

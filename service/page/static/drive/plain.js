@@ -3,7 +3,7 @@
 import { colour } from "../base/curves.js";
 import { body, circle, hills, line } from "../replay/flat.js";
 import { NODES_N, moment, nodesAt, pointAt } from "../replay/motion.js";
-import { SHADES } from "./live.js";
+import { SHADES, evened } from "./live.js";
 
 const VIEW_M = 9, GRAB_M = 1.1, ARROW_M_PER_N_S = 0.015;
 
@@ -41,7 +41,7 @@ export function plain(place, robots) {
     pen.fillRect(0, 0, width, height);
     hills(pen, robots[0], x, y, size);
     robots.forEach((one, k) => {
-      line(pen, one.trail.map(([px, py]) => [x(px), y(py)]), colour(k ? SHADES[k] : "cap"), 3);
+      line(pen, evened(one.trail).map(([px, py]) => [x(px), y(py)]), colour(k ? SHADES[k] : "cap"), 3);
       circle(pen, one.mark, one.waypoint_radius_m, colour(k ? SHADES[k] : "cap"), x, y, size);
       body(pen, one, nodes[k], moment(one, time_s).row, colour(SHADES[k]), x, y, size);
     });

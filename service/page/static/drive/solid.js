@@ -6,7 +6,7 @@ import { heightOf, moment } from "../replay/motion.js";
 import { robot } from "../replay/robot.js";
 import { band, dispose, ground, waypoint } from "../replay/surroundings.js";
 import { theatre } from "../replay/theatre.js";
-import { SHADES } from "./live.js";
+import { SHADES, evened } from "./live.js";
 
 const PLANE_M = 24, TRAIL_M = 0.05, SOFT = 0.04, NEAR_PX = 22, ARROW_M_PER_N_S = 0.015;
 
@@ -53,7 +53,7 @@ export function solid(place, robots) {
     if (part.one.trail.length === part.trail_n || part.one.trail.length < 2) return;
     part.trail_n = part.one.trail.length;
     dispose(part.way);
-    part.way.add(band(part.one.trail, height, TRAIL_M, new THREE.MeshBasicMaterial({ color: colour(k ? SHADES[k] : "cap"), side: THREE.DoubleSide, transparent: true, opacity: 0.8 })).mesh);
+    part.way.add(band(evened(part.one.trail), height, TRAIL_M, new THREE.MeshBasicMaterial({ color: colour(k ? SHADES[k] : "cap"), side: THREE.DoubleSide, transparent: true, opacity: 0.8 })).mesh);
   }
 
   function aim(x, y) {
@@ -105,13 +105,23 @@ export function solid(place, robots) {
       if (arrow) forget(arrow);
       arrow = null;
       const length = impulse ? ARROW_M_PER_N_S * Math.hypot(...impulse) : 0;
-      if (length > 0.02) {
-        arrow = new THREE.ArrowHelper(new THREE.Vector3(...impulse, 0).normalize(), com(k), length, new THREE.Color(colour("bad")), Math.min(0.3, length / 2), 0.2);
-        stage.world.add(arrow);
-      }
+      if (length > 0.02) stage.world.add((arrow = pull(com(k), impulse, length)));
       stage.centreOn(centre);
     },
   };
+}
+
+/** An arrow from a point in a horizontal direction, seen through everything. */
+function pull(from, [x, y], length_m) {
+  const group = new THREE.Group(), material = new THREE.MeshBasicMaterial({ color: colour("bad"), depthTest: false, transparent: true });
+  const shaft = new THREE.Mesh(new THREE.CylinderGeometry(0.035, 0.035, length_m, 12), material), tip = new THREE.Mesh(new THREE.ConeGeometry(0.12, 0.3, 16), material);
+  shaft.position.y = length_m / 2;
+  tip.position.y = length_m;
+  group.add(shaft, tip);
+  group.renderOrder = shaft.renderOrder = tip.renderOrder = 9;
+  group.position.copy(from);
+  group.quaternion.setFromUnitVectors(new THREE.Vector3(0, 1, 0), new THREE.Vector3(x, y, 0).normalize());
+  return group;
 }
 
 /** From a point to a line between two others. */
