@@ -84,7 +84,7 @@ def presets() -> list[str]:
 
 
 def load(source: str, overrides: Sequence[str] = ()) -> Config:
-    """Configuration from a preset's name or a TOML file, with overrides `key=value` (dotted key, TOML value).
+    """Configuration from a preset's name or a TOML file, with overrides `key=value` (dotted key, TOML value or none).
 
     ConfigError if the source is unknown or not TOML, or a key or value is not allowed.
     """
@@ -221,7 +221,7 @@ def _overridden(values: dict[str, JsonValue], overrides: Sequence[str]) -> dict[
             if not isinstance(inner, dict):
                 raise ConfigError(f"--set {key}: {section} is not a section; allowed: {', '.join(_known_keys())}")
             table = inner
-        table[name] = value
+        table[name] = None if value == "" else value  # TOML has no word for none
     return values
 
 

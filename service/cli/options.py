@@ -33,7 +33,8 @@ RunName = Annotated[str, typer.Argument(metavar="RUN", help="Name of a run (see 
 JobName = Annotated[str, typer.Argument(metavar="JOB|RUN", help="Name of a job (see `t6gps jobs`), or of its run.")]
 Json = Annotated[bool, typer.Option("--json", help="Print one JSON object.")]
 Overrides = Annotated[
-    list[str] | None, typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7.")
+    list[str] | None,
+    typer.Option("--set", metavar="KEY=VALUE", help="Change a setting, e.g. robot.friction=0.7; no value is none."),
 ]
 Publish = Annotated[
     str | None,

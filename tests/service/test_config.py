@@ -175,6 +175,15 @@ def test_differences_name_the_key_and_both_values_and_ignore_what_data_do_not_de
     assert configuration.differences(a, a) == []
 
 
+def test_an_option_that_a_file_sets_is_none_by_an_override_without_a_value(tmp_path: Path) -> None:
+    file = tmp_path / "own.toml"
+    file.write_text("[robot]\ndead_winch = 3\n")
+    assert load(str(file)).robot.dead_winch == 3
+    assert load(str(file), ["robot.dead_winch="]).robot.dead_winch is None
+    with pytest.raises(ConfigError, match=r"robot\.friction must be a valid number, found None"):
+        load(str(file), ["robot.friction="])
+
+
 def test_an_option_that_may_be_none_is_none_by_default_so_that_a_run_can_leave_it_out() -> None:
     assert "null" not in Config().to_json()
     for section in Config.model_fields:
