@@ -8,7 +8,7 @@ import { band, dispose, ground, waypoint } from "../replay/surroundings.js";
 import { theatre } from "../replay/theatre.js";
 import { SHADES, evened } from "./live.js";
 
-const PLANE_M = 24, TRAIL_M = 0.05, SOFT = 0.04, NEAR_PX = 22, ARROW_M_PER_N_S = 0.015;
+const PLANE_M = 24, TRAIL_M = 0.05, SOFT = 0.04, NEAR_PX = 22, INSIDE = 0.8, ARROW_M_PER_N_S = 0.015;
 
 /** A stage in an element for the robots of a drive. */
 export function solid(place, robots) {
@@ -73,18 +73,18 @@ export function solid(place, robots) {
       const found = ray.intersectObject(floor.children[0])[0]?.point;
       return found ? [found.x, found.y] : null;
     },
-    /** The number of the robot under a pointer, null where there is none: of those the nearest. */
+    /** The number of the robot under a pointer, or nearly so, null where there is none: of those the nearest. */
     robotAt(x, y) {
       const seen = (point) => {
         hit.fromArray(point).project(stage.camera);
         return [((hit.x + 1) / 2) * place.clientWidth, ((1 - hit.y) / 2) * place.clientHeight];
       };
-      const far = parts.map(({ one, body }) => {
-        const nodes = body.nodes().map(seen);
-        return Math.min(...one.bars.map(([a, b]) => distance([x, y], nodes[a], nodes[b])), ...one.cables.map(([a, b]) => distance([x, y], nodes[a], nodes[b])));
+      const far = parts.map(({ body }, k) => {
+        const middle = seen(com(k).toArray()), size_px = Math.max(...body.nodes().map((node) => distance(seen(node), middle)));
+        return distance([x, y], middle) / Math.max(INSIDE * size_px, NEAR_PX);
       });
       const nearest = far.indexOf(Math.min(...far));
-      return far[nearest] < NEAR_PX ? nearest : null;
+      return far[nearest] < 1 ? nearest : null;
     },
     /** The place under a pointer at the height of a robot. */
     beside(x, y, k) {
@@ -124,8 +124,4 @@ function pull(from, [x, y], length_m) {
   return group;
 }
 
-/** From a point to a line between two others. */
-export function distance([x, y], [ax, ay], [bx, by]) {
-  const dx = bx - ax, dy = by - ay, share = Math.min(Math.max(((x - ax) * dx + (y - ay) * dy) / (dx * dx + dy * dy || 1), 0), 1);
-  return Math.hypot(x - ax - share * dx, y - ay - share * dy);
-}
+const distance = ([ax, ay], [bx, by]) => Math.hypot(ax - bx, ay - by);
