@@ -5,7 +5,8 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
-from t6gps.service.training import origin, policies
+from t6gps.service.training import evaluation_records, origin, policies
+from t6gps.storage import spool, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.records import PolicySnapshot
@@ -47,26 +48,34 @@ class Order:
         return replace(self, start=replace(self.start, terrain_difficulty=terrain_difficulty))
 
 
-def entrant(run: Run, version: int | None) -> Entrant:
-    """A policy of a run by its version, the newest by default. RunError naming the versions that are kept."""
+def entrant(run: Run, version: int | None, evaluation_id: int | None = None) -> Entrant:
+    """A policy of a run by its version, the newest by default, in the world of the run or of one of its evaluations.
+
+    RunError naming the versions that are kept, DataError naming the evaluations.
+    """
     policy = policies.load(run, version)
-    return Entrant(run.name, policy.version, origin.configured(run).rollout, policy)
+    if evaluation_id is None:
+        config = origin.configured(run)
+    else:
+        config = evaluation_records.world(run, tables.read(run, "evaluations"), evaluation_id)
+    return Entrant(run.name, policy.version, config.rollout, policy)
 
 
-def order(
-    entrants: Sequence[Entrant],
-    seed: int,
-    terrain_seed: int,
-    difficulty: float | None,
-    number: int,
-    friction: float | None,
-) -> Order:
+def start(run: Run, number: int, evaluation_id: int | None, difficulty: float) -> Start:
+    """Where an episode of a run began, also one that waits for its iteration. DataError where there is none."""
+    newest = spool.newest(run.spool) if evaluation_id is None else None
+    found = newest if newest is not None and newest.episode_id == number else tables.episode(run, number, evaluation_id)
+    seed, terrain_seed, index = (found.summary[name][0].as_py() for name in ("seed", "terrain_seed", "index"))
+    return Start(seed, terrain_seed, difficulty, index)
+
+
+def order(entrants: Sequence[Entrant], began: Start, difficulty: float | None, friction: float | None) -> Order:
     """Let entrants begin on the ground and with the task of the first; each brings the robot of its run.
 
-    difficulty   of the ground, None for that of the first one's run. ConfigError where that is the ground of a file
+    difficulty   of the ground, None for that of the start. ConfigError where that is the ground of a file
     """
     world = entrants[0].settings
     shared = {"terrain": world.terrain, "task": world.task}
     alike = tuple(replace(one, settings=one.settings.model_copy(update=shared)) for one in entrants)
-    configured = Order(alike, Start(seed, terrain_seed, world.terrain.difficulty, number), friction)
-    return configured if difficulty in (None, world.terrain.difficulty) else configured.at(difficulty)
+    wanted = Order(alike, began, friction)
+    return wanted if difficulty in (None, began.terrain_difficulty) else wanted.at(difficulty)

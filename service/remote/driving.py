@@ -22,10 +22,14 @@ class Driving:
 
     server: Connection
 
-    def begin(self, entries: Sequence[tuple[str, int | None]], **start: JsonValue) -> str:
-        """Let policies run, each of a run and a version; the drive's identifier. `start` has fields of DriveRequest."""
+    def begin(self, entries: Sequence[tuple[str, int | None]], episode: int, **more: JsonValue) -> str:
+        """Let policies run, each of a run and a version, from the start of an episode; the drive's identifier.
+
+        `more` has the other fields of DriveRequest.
+        """
         wanted = [DriveEntry(run=run, version=version) for run, version in entries]
-        return self.server.post("/drives", DriveBegun, checked(DriveRequest, entries=wanted, **start)).id
+        request = checked(DriveRequest, entries=wanted, episode=episode, **more)
+        return self.server.post("/drives", DriveBegun, request).id
 
     def frames(self, drive: str) -> Iterator[Update]:
         """What is seen of a drive, until it ends."""

@@ -33,7 +33,6 @@ Text = Annotated[str, StringConstraints(max_length=200)]
 Scalar = bool | int | Number | Text
 NUMBER_MOST = 10**9
 """Of an episode, an evaluation or a version."""
-Seed = Annotated[int, Field(ge=0, lt=2**63)]
 
 
 class Scope(StrEnum):
@@ -143,17 +142,16 @@ class DriveEntry(Message):
 
 
 class DriveRequest(Message):
-    """Policies to drive on one ground; seeds, difficulty, number and friction are those of an episode.
+    """Policies to drive from the start of an episode of the first one's run, of training or of an evaluation.
 
-    Without a difficulty or a friction, those of the first one's run hold.
+    friction, terrain_difficulty   other ones than that episode had
     """
 
     entries: list[DriveEntry] = Field(min_length=1, max_length=ROBOTS_MOST_N)
-    seed: Seed = 0
-    terrain_seed: Seed = 0
-    terrain_difficulty: Difficulty | None = None
-    number: int = Field(0, ge=0, le=NUMBER_MOST)
+    episode: int = Field(ge=0, le=NUMBER_MOST)
+    evaluation: Annotated[int, Field(ge=0, le=NUMBER_MOST)] | None = None
     friction: Friction | None = None
+    terrain_difficulty: Difficulty | None = None
 
 
 class DriveBegun(Message):

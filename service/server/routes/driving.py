@@ -51,9 +51,12 @@ async def begin(operation: Operation, request: DriveRequest, place: Place, asker
     operation.update(request.model_dump())
 
     def wanted() -> Order:
-        entrants = [orders.entrant(named(place, entry.run), entry.version) for entry in request.entries]
-        seeds = request.seed, request.terrain_seed
-        return orders.order(entrants, *seeds, request.terrain_difficulty, request.number, request.friction)
+        first, *others = ((named(place, entry.run), entry.version) for entry in request.entries)
+        leader = orders.entrant(*first, request.evaluation)
+        entrants = [leader, *(orders.entrant(*other) for other in others)]
+        difficulty = leader.settings.terrain.difficulty
+        began = orders.start(first[0], request.episode, request.evaluation, difficulty)
+        return orders.order(entrants, began, request.terrain_difficulty, request.friction)
 
     order = await run_in_threadpool(wanted)
     return DriveBegun(id=place.drives.begin(order, asker.id, asker.name, lambda: place.holds(asker)))

@@ -15,16 +15,17 @@ from t6gps.service.driving.commands import Command
 from t6gps.service.driving.order import Entrant, Order, order
 from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
-from t6gps.workers.settings import RobotSettings
+from t6gps.workers.driving import Start
+from t6gps.workers.settings import RobotSettings, TerrainSettings
 
+START = Start(1, 2, 0.0, 0)
 WIDTHS = [schema.OBSERVATION_N, 16, 24]
 
 
-def entrant(run: str, difficulty: float = 0.0, weight: float = 0.0) -> Entrant:
+def entrant(run: str, weight: float = 0.0) -> Entrant:
     """A policy that stands still."""
     layers = tuple((np.full((b, a), weight, np.float32), np.zeros(b, np.float32)) for a, b in pairwise(WIDTHS))
-    config = configuration.load("flat-quick", [f"terrain.difficulty={difficulty}"])
-    return Entrant(run, 1, config.rollout, PolicySnapshot(1, layers, 1.088, 0.2))
+    return Entrant(run, 1, configuration.load("flat-quick").rollout, PolicySnapshot(1, layers, 1.088, 0.2))
 
 
 def simulated(wanted: Order, *commands: Command) -> list[tuple[str, object]]:
@@ -37,7 +38,7 @@ def simulated(wanted: Order, *commands: Command) -> list[tuple[str, object]]:
 
 
 def test_it_tells_the_scene_and_the_start_and_ends_with_its_input() -> None:
-    told = simulated(order([entrant("a"), entrant("b")], 1, 2, None, 0, 0.3))
+    told = simulated(order([entrant("a"), entrant("b")], START, None, 0.3))
     assert [kind for kind, _ in told[:2]] == ["scene", "frame"]
     scene, frame = told[0][1], told[1][1]
     assert isinstance(scene, dict)
@@ -48,7 +49,7 @@ def test_it_tells_the_scene_and_the_start_and_ends_with_its_input() -> None:
 
 
 def test_a_robot_that_cannot_be_driven_is_the_end_with_a_reason() -> None:
-    told = simulated(order([entrant("a", weight=float("nan"))], 1, 2, None, 0, None))
+    told = simulated(order([entrant("a", weight=float("nan"))], START, None, None))
     assert told[-1][0] == "end"
     assert "must hold finite float32 numbers" in str(told[-1][1])
 
@@ -56,8 +57,9 @@ def test_a_robot_that_cannot_be_driven_is_the_end_with_a_reason() -> None:
 def test_who_races_brings_its_robot_onto_the_ground_of_the_first() -> None:
     heavy = entrant("b")
     robot = RobotSettings(bar_mass_kg=9.0)
-    other = Entrant("b", 1, heavy.settings.model_copy(update={"robot": robot}), heavy.policy)
-    both = order([entrant("a", difficulty=0.7), other], 1, 2, None, 0, None)
-    assert [one.settings.terrain.difficulty for one in both.entrants] == [0.7, 0.7]
+    changed = {"robot": robot, "terrain": TerrainSettings(size_m=50.0)}
+    other = Entrant("b", 1, heavy.settings.model_copy(update=changed), heavy.policy)
+    both = order([entrant("a"), other], START, 0.7, None)
+    assert [one.settings.terrain.size_m for one in both.entrants] == [40.0, 40.0]
     assert both.entrants[1].settings.robot.bar_mass_kg == 9.0
     assert (both.start.terrain_difficulty, both.half_size_m, both.at(0.0).half_size_m) == (0.7, 20.0, None)

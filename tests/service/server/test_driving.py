@@ -21,7 +21,7 @@ from t6gps.service.remote.stream import Update
 from t6gps.service.server import app, tokens
 from t6gps.storage import catalog, schema
 from t6gps.storage.delta import iterations
-from t6gps.storage.errors import ConfigError, RunError, ServerError
+from t6gps.storage.errors import ConfigError, DataError, RunError, ServerError
 from t6gps.storage.records import Episode, Learned, PolicySnapshot
 
 PATIENCE, BRIEF = Patience(alone_s=120.0, look_s=0.05), Patience(alone_s=0.2, look_s=0.05)
@@ -89,7 +89,7 @@ def _read(path: Path) -> str:
 def test_a_drive_is_seen_steered_and_ended_and_two_race_on_one_ground(
     server: Server, client: Client, wait_until: Callable[..., None]
 ) -> None:
-    drive = client.drives.begin([("walk", 1), ("walk", None)], seed=5, terrain_seed=6)
+    drive = client.drives.begin([("walk", 1), ("walk", None)], 0)
     with server.client(Scope.READ) as reader:
         frames, others = client.drives.frames(drive), reader.drives.frames(drive)
         scene = until(frames, lambda update: update.kind == "scene").data
@@ -127,13 +127,13 @@ def test_a_drive_is_seen_steered_and_ended_and_two_race_on_one_ground(
 
 
 def test_a_third_drive_is_refused_and_who_may_operate_can_end_any(server: Server, client: Client) -> None:
-    drives = [client.drives.begin([("walk", 1)]) for _ in range(2)]
+    drives = [client.drives.begin([("walk", 1)], 0) for _ in range(2)]
     with pytest.raises(ServerError, match="2 drives are under way, by operate and operate"):
-        client.drives.begin([("walk", 1)])
+        client.drives.begin([("walk", 1)], 0)
     with server.client(Scope.ADMIN) as admin:
         for drive in drives:
             admin.drives.end(drive)
-    client.drives.end(client.drives.begin([("walk", 1)]))
+    client.drives.end(client.drives.begin([("walk", 1)], 0))
 
 
 def test_a_drive_that_nobody_looks_at_ends(server: Server, wait_until: Callable[..., None]) -> None:
@@ -142,7 +142,7 @@ def test_a_drive_that_nobody_looks_at_ends(server: Server, wait_until: Callable[
         listening(app.create(server.root, start=server.launch, limits=limits)) as url,
         Client(url, server.tokens[Scope.OPERATE]) as client,
     ):
-        drive = client.drives.begin([("walk", 1)])
+        drive = client.drives.begin([("walk", 1)], 0)
 
         def gone() -> bool:
             try:
@@ -156,7 +156,7 @@ def test_a_drive_that_nobody_looks_at_ends(server: Server, wait_until: Callable[
 
 
 def test_a_drive_ends_with_the_token_that_began_it(server: Server, client: Client) -> None:
-    drive = client.drives.begin([("walk", 1)])
+    drive = client.drives.begin([("walk", 1)], 0)
     frames = client.drives.frames(drive)
     until(frames, frame(0))
     server.later = timedelta(days=2)
@@ -167,10 +167,10 @@ def test_a_drive_ends_with_the_token_that_began_it(server: Server, client: Clien
 
 
 def test_others_look_on_and_steer_nothing(server: Server, client: Client) -> None:
-    drive = client.drives.begin([("walk", 1)])
+    drive = client.drives.begin([("walk", 1)], 0)
     with server.client(Scope.READ) as reader, server.client(Scope.ADMIN) as admin:
         with pytest.raises(ServerError, match="needs operate"):
-            reader.drives.begin([("walk", 1)])
+            reader.drives.begin([("walk", 1)], 0)
         with pytest.raises(ServerError, match="needs operate"):
             reader.drives.steer(drive, paused=True)
         with pytest.raises(ServerError, match="'operate' began this drive and steers it"):
@@ -200,10 +200,14 @@ def test_a_command_out_of_its_range_is_refused_before_it_is_sent_and_by_the_serv
 
 def test_what_no_drive_can_do_is_refused_and_the_drive_goes_on(server: Server, client: Client) -> None:
     with pytest.raises(RunError, match="no run 'none'"):
-        client.drives.begin([("none", 1)])
+        client.drives.begin([("none", 1)], 0)
     with pytest.raises(RunError, match="keeps no policy of version 9; kept: 1"):
-        client.drives.begin([("walk", 9)])
-    drive = client.drives.begin([("walk", 1)], terrain_difficulty=0.5)
+        client.drives.begin([("walk", 9)], 0)
+    with pytest.raises(DataError, match="has no episode 7"):
+        client.drives.begin([("walk", 1)], 7)
+    with pytest.raises(DataError, match="keeps no evaluation 3; kept: none"):
+        client.drives.begin([("walk", 1)], 0, evaluation=3)
+    drive = client.drives.begin([("walk", 1)], 0, terrain_difficulty=0.5)
     frames = client.drives.frames(drive)
     for command, said in (
         ({"push": {"robot": 1, "impulse_n_s": [1.0, 0.0, 0.0]}}, "robot 1 is none"),
@@ -220,6 +224,6 @@ def test_a_server_that_stops_leaves_no_simulation(server: Server, wait_until: Ca
         listening(app.create(server.root, start=server.launch)) as url,
         Client(url, server.tokens[Scope.OPERATE]) as client,
     ):
-        client.drives.begin([("walk", 1)])
+        client.drives.begin([("walk", 1)], 0)
         wait_until(lambda: bool(children()), LONG_S)
     wait_until(lambda: not children(), LONG_S)

@@ -39,9 +39,8 @@ export function open(place, episode, leave) {
       const entries = values.policies ? read(values.policies) : [{ run: episode.run, version: await acting(episode, left.signal) }];
       wanted = { ...values, policies: written(entries) };
       racers.show(entries);
-      const { seed, terrain_seed, terrain_difficulty, index, friction } = episode.summary;
-      const start = { seed, terrain_seed, terrain_difficulty: Number(values.terrain ?? terrain_difficulty), number: index, friction: Number(values.friction ?? friction) };
-      const { id } = await post("/v1/drives", { entries, ...start });
+      const other = (value) => (value === undefined ? null : Number(value));
+      const { id } = await post("/v1/drives", { entries, episode: episode.episode, evaluation: episode.evaluation, friction: other(values.friction), terrain_difficulty: other(values.terrain) });
       drive = id;
       noted({ drive: id });
       look(values.waypoint);
