@@ -60,6 +60,7 @@ export function hills(pen, { ground }, x, y, scale) {
   for (let i = 0; i < ground.rows - 1; i += 1)
     for (let j = 0; j < ground.columns - 1; j += 1) {
       const left = ground.x_m + i * cell_m, low = ground.y_m + j * cell_m;
+      if (x(left + cell_m) < 0 || x(left) > pen.canvas.width || y(low) < 0 || y(low + cell_m) > pen.canvas.height) continue;
       const level = Math.min(Math.max(height(left + cell_m / 2, low + cell_m / 2) / 1.6 + 0.5, 0), 1);
       pen.fillStyle = `rgb(${Math.round(95 + 110 * level)} ${Math.round(125 + 70 * level)} ${Math.round(95 + 60 * level)})`;
       pen.fillRect(x(left), y(low + cell_m), cell_m * scale + 1, cell_m * scale + 1);

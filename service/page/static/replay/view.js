@@ -88,7 +88,7 @@ export function open(place) {
   /** Show a drive in the place of the replay, where the address says so. */
   async function driven(values) {
     const whether = Boolean(values.drive) && loaded.length > 0;
-    for (const part of [stages, lines, scrub, transport, details]) part.hidden = whether;
+    for (const part of [said, stages, lines, scrub, transport, details]) part.hidden = whether;
     wheel.hidden = whether || !loaded.length;
     if (drive && (!whether || drive.episode !== loaded[0])) drive.view.close(), (drive = null);
     if (!whether) return;
