@@ -43,6 +43,21 @@ def drawn(page: Page) -> np.ndarray:
     return np.array([[float(cell) for cell in row[1:]] for row in cells])
 
 
+def test_a_pause_of_the_page_that_is_over_leaves_nothing_behind(visit: Opened) -> None:
+    left_behind = visit("").evaluate(
+        """async () => {
+          const { pause } = await import("/page/base/api.js"), signal = new AbortController().signal;
+          let listening = 0;
+          const add = signal.addEventListener, remove = signal.removeEventListener;
+          signal.addEventListener = (...all) => (listening++, add.apply(signal, all));
+          signal.removeEventListener = (...all) => (listening--, remove.apply(signal, all));
+          await pause(1, signal);
+          return listening;
+        }"""
+    )
+    assert left_behind == 0
+
+
 def test_the_list_finds_runs_and_those_alike_make_one_curve(visit: Opened, served: Server) -> None:
     page = visit("", Scope.READ)
     rows = page.locator(".rows tbody tr")

@@ -106,8 +106,9 @@ async function sentence(answer) {
 /** Wait; ends with an error when the signal says so. */
 export function pause(ms, signal) {
   return new Promise((done, failed) => {
-    const timer = setTimeout(done, ms);
-    signal?.addEventListener("abort", () => (clearTimeout(timer), failed(new DOMException("left", "AbortError"))), { once: true });
+    const leave = () => (clearTimeout(timer), failed(new DOMException("left", "AbortError")));
+    const timer = setTimeout(() => (signal?.removeEventListener("abort", leave), done()), ms);
+    signal?.addEventListener("abort", leave, { once: true });
   });
 }
 
