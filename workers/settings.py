@@ -9,6 +9,9 @@ from t6gps.storage.settings import Settings
 STEEPEST_DIFFICULTY = 1.5
 """Slopes of 48 deg on average, heights over a range of 2.3 m."""
 
+LEAST_FRICTION, LARGEST_FRICTION = 0.05, 1.5
+"""Wet ice, and rubber on a dry road."""
+
 HALF_DIAMETER_M = 1.084492969087398
 """Distance of a node from the centre in the neutral shape. The paper's waypoints "are half the diameter of the vehicle"
 (Sec. IV-A), which may also mean their diameter: the radius would then be half of this."""
@@ -49,7 +52,9 @@ class RobotSettings(Settings):
     dead_winch: Cable | None = Field(None, description="cable whose winch never moves, 0 .. 23")
     shortest_command_m: float = Field(0.5, ge=0.4, le=1.2, description="lower end of commanded rest lengths (m)")
     longest_command_m: float = Field(1.5, ge=0.8, le=1.6, description="upper end of commanded rest lengths (m)")
-    friction: float = Field(1.0, ge=0.05, le=1.5, description="effective coefficient between bars and ground")
+    friction: float = Field(
+        1.0, ge=LEAST_FRICTION, le=LARGEST_FRICTION, description="effective coefficient between bars and ground"
+    )
     physics_step_s: float = Field(0.004, ge=0.0005, le=0.01, description="physics step; divides the control step (s)")
 
     @model_validator(mode="after")

@@ -25,6 +25,7 @@ from t6gps.service.launch.control import JobLine, Standing
 from t6gps.service.launch.fetch import File
 from t6gps.service.remote.administration import Administration
 from t6gps.service.remote.connection import Connection, checked
+from t6gps.service.remote.driving import Driving
 from t6gps.service.remote.messages import (
     Health,
     QueryForm,
@@ -59,6 +60,7 @@ class Client:
         token = os.environ.get(TOKEN_VARIABLE, "") if token is None else token
         self.server = Connection(url, token.strip(), transport)
         self.admin = Administration(self.server)
+        self.drives = Driving(self.server)
 
     def __enter__(self) -> Client:
         return self

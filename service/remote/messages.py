@@ -9,6 +9,7 @@ from typing import Annotated
 from pydantic import BaseModel, ConfigDict, Field, JsonValue, StringConstraints, WithJsonSchema
 
 from t6gps.service.config import WORKERS_MOST_N, presets
+from t6gps.service.driving.commands import ROBOTS_MOST_N, Difficulty, Friction
 from t6gps.service.steering.requests import SCALE_DEADLINE_S, STOP_DEADLINE_S
 from t6gps.storage.catalog import NAME_LENGTH_N
 from t6gps.storage.sql.query import SQL_BYTES_N
@@ -30,6 +31,8 @@ Number = Annotated[float, Field(allow_inf_nan=False)]
 CursorText = Annotated[str, StringConstraints(pattern=r"^[0-9]{1,9}-[0-9]{1,9}$")]
 Text = Annotated[str, StringConstraints(max_length=200)]
 Scalar = bool | int | Number | Text
+NUMBER_MOST = 10**9
+"""Of an episode, an evaluation or a version."""
 
 
 class Scope(StrEnum):
@@ -129,6 +132,32 @@ class QueryRequest(Message):
     sql: Annotated[str, StringConstraints(max_length=SQL_BYTES_N)]
     parameters: dict[ParameterName, Scalar | list[Scalar]] = Field(default={}, max_length=100)
     form: Annotated[QueryForm, Field(strict=False)] = QueryForm.ARROW
+
+
+class DriveEntry(Message):
+    """A policy of a run that is to be driven, the newest by default."""
+
+    run: RunName
+    version: Annotated[int, Field(ge=0, le=NUMBER_MOST)] | None = None
+
+
+class DriveRequest(Message):
+    """Policies to drive from the start of an episode of the first one's run, of training or of an evaluation.
+
+    friction, terrain_difficulty   other ones than that episode had
+    """
+
+    entries: list[DriveEntry] = Field(min_length=1, max_length=ROBOTS_MOST_N)
+    episode: int = Field(ge=0, le=NUMBER_MOST)
+    evaluation: Annotated[int, Field(ge=0, le=NUMBER_MOST)] | None = None
+    friction: Friction | None = None
+    terrain_difficulty: Difficulty | None = None
+
+
+class DriveBegun(Message):
+    """The drive that has begun."""
+
+    id: str
 
 
 class TokenRequest(Message):

@@ -12,14 +12,16 @@ from fastapi.exceptions import RequestValidationError
 from fastapi.responses import Response
 from starlette.exceptions import HTTPException
 
+from t6gps.service.driving.drives import Drives
 from t6gps.service.monitoring import exporter
 from t6gps.service.monitoring.exporter import Exporter
 from t6gps.service.page import files as page
 from t6gps.service.remote.messages import Health
 from t6gps.service.server.guard import Clock, Guard, Limits, refusal, utc_now
 from t6gps.service.server.launching import Launch, launch
-from t6gps.service.server.routes import administering, jobs, operating, reading, stored
+from t6gps.service.server.routes import administering, driving, jobs, operating, reading, stored
 from t6gps.service.server.routes.access import REFUSALS, Answers, NoSuchRunError, Reading, Served, Slots
+from t6gps.service.server.tokens import Verifier
 from t6gps.storage.errors import ConfigError, QueryError, RunError, ServerError, T6GpsError
 
 LOOPBACK = frozenset({"localhost", "127.0.0.1", "[::1]"})
@@ -45,7 +47,10 @@ def create(
     """
     version = metadata.version("t6gps")
     app = FastAPI(title="t6gps", version=version, docs_url=None, redoc_url=None, redirect_slashes=False)
-    app.state.served = Served(root, start, limits.query_s)
+    known = Verifier(root)
+    app.state.served = Served(
+        root, start, limits.query_s, Drives(limits.drives), lambda token: known.holds(token, now())
+    )
     app.add_middleware(Guard, root=root, names=names, scheme=scheme, now=now, limits=limits)
     for routes in (
         reading.routes,
@@ -53,6 +58,7 @@ def create(
         stored.asking,
         jobs.routes,
         operating.routes,
+        driving.routes,
         administering.routes,
         _monitoring(root),
         page.routes(),

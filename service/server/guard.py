@@ -10,7 +10,7 @@ import logging
 import math
 import time
 from collections.abc import Awaitable, Callable, Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from datetime import UTC, datetime
 from http import HTTPStatus
 from pathlib import Path
@@ -21,6 +21,7 @@ from starlette.exceptions import HTTPException
 from starlette.responses import JSONResponse
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from t6gps.service.driving.drive import Patience
 from t6gps.service.page.files import is_of_page
 from t6gps.service.remote.messages import AuditLine
 from t6gps.service.server import audit
@@ -44,6 +45,7 @@ class Limits:
     requests       of one token: each second, and at once
     failures       of one address without a valid token: each second, and at once
     query_s        that a query may take
+    drives         how long somebody may drive a policy
     """
 
     body_bytes_n: int = 2**20
@@ -51,6 +53,7 @@ class Limits:
     requests: tuple[float, int] = (200.0, 400)
     failures: tuple[float, int] = (1.0, 20)
     query_s: float = 30.0
+    drives: Patience = field(default_factory=Patience)
 
 
 def utc_now() -> datetime:

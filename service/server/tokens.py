@@ -108,6 +108,12 @@ class Verifier:
             raise RefusedTokenError(f"token {token.name!r} expired at {when}; ask for another one (t6gps token create)")
         return token
 
+    def holds(self, token: Token, now: datetime) -> bool:
+        """True while a token that was verified is neither revoked nor expired."""
+        self._refresh()
+        known = self._tokens.get(token.id)
+        return known is not None and known.expires > now
+
     def _refresh(self) -> None:
         try:
             state = _path(self._root).stat()

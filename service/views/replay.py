@@ -15,15 +15,14 @@ from numpy.typing import NDArray
 
 from t6gps.service.config import Config
 from t6gps.service.training import evaluation_records, origin
+from t6gps.service.views.ground import Ground, around, rounded
 from t6gps.storage import spool, tables
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import DataError
 from t6gps.storage.records import Episode
 from t6gps.workers.ground.ground import ground
-from t6gps.workers.ground.terrain import Terrain
 from t6gps.workers.pictures.motion import of_episode
 from t6gps.workers.pictures.stays import stays, stuck
-from t6gps.workers.pictures.viewer.ground_mesh import REACH_M
 from t6gps.workers.pictures.viewer.world import World
 from t6gps.workers.robot.recorded import numbers
 from t6gps.workers.robot.symmetry import EDGE_NAMES, ELEMENTS_N
@@ -34,21 +33,6 @@ BOUNDS = {"face": FACES_N, "element": ELEMENTS_N, "entry_edge": len(EDGE_NAMES[0
 """Columns that name parts of the robot, and how many there are."""
 FARTHEST_M = 1e4
 """Of anything from the origin: no robot walks so far."""
-
-
-@dataclass(frozen=True)
-class Ground:
-    """The ground around an episode's path: heights [rows, columns] (m) at x_m + i cell_m, y_m + j cell_m.
-
-    The diagonal of a cell runs from (i, j) to (i + 1, j + 1).
-    """
-
-    x_m: float
-    y_m: float
-    cell_m: float
-    rows: int
-    columns: int
-    heights_m: list[float]
 
 
 @dataclass(frozen=True)
@@ -145,12 +129,12 @@ def replay(name: str, config: Config, episode: Episode, evaluation_id: int | Non
         episode=episode.episode_id,
         evaluation=evaluation_id,
         summary=summary,
-        time_s=_rounded(numbers(episode.frames, "time_s"), 4),
-        com_m=_rounded(moved.com, 4),
-        nodes_m=_rounded(moved.nodes, 4),
-        tensions_n=_rounded(moved.tensions, 1),
-        forward_speed_m_per_s=_rounded(numbers(episode.frames, "forward_speed_m_per_s"), 4),
-        cost=_rounded(numbers(episode.frames, "cost"), 4),
+        time_s=rounded(numbers(episode.frames, "time_s"), 4),
+        com_m=rounded(moved.com, 4),
+        nodes_m=rounded(moved.nodes, 4),
+        tensions_n=rounded(moved.tensions, 1),
+        forward_speed_m_per_s=rounded(numbers(episode.frames, "forward_speed_m_per_s"), 4),
+        cost=rounded(numbers(episode.frames, "cost"), 4),
         face=numbers(episode.frames, "face").astype(int).tolist(),
         segments=[Span(*stay) for stay in stays(episode.frames)],
         stuck=_spans(stuck(moved.com)),
@@ -163,7 +147,7 @@ def replay(name: str, config: Config, episode: Episode, evaluation_id: int | Non
         attached_share=config.robot.attachment_span_m / BAR_LENGTH_M,
         waypoint_radius_m=world.waypoint_radius_m,
         ground_id="plane" if terrain is None else hashlib.sha256(terrain.heights.tobytes()).hexdigest()[:16],
-        ground=None if terrain is None else _around(terrain, moved.com[:, :2]),
+        ground=None if terrain is None else around(terrain, moved.com[:, :2]),
     )
 
 
@@ -182,11 +166,6 @@ def _check(name: str, episode: Episode) -> None:
         )
 
 
-def _rounded(values: Array, decimals: int) -> list[float]:
-    flat: list[float] = np.round(values, decimals).ravel().tolist()
-    return flat
-
-
 def _spans(held: NDArray[np.bool_]) -> list[tuple[int, int]]:
     """Where a condition holds, as [start, stop)."""
     turns = np.flatnonzero(np.diff(np.r_[False, held, False])).tolist()
@@ -197,14 +176,3 @@ def _marks(episode: Episode) -> list[Mark]:
     x, y = (numbers(episode.frames, f"waypoint_{axis}_m") for axis in "xy")
     changes = np.flatnonzero(np.r_[True, (np.diff(x) != 0) | (np.diff(y) != 0)]).tolist()
     return [Mark(row, round(float(x[row]), 4), round(float(y[row]), 4)) for row in changes]
-
-
-def _around(terrain: Terrain, path: Array) -> Ground:
-    """The part of a ground that one sees from a path [n, 2] (m)."""
-    middle = (len(terrain.heights) - 1) / 2
-    low = np.floor((path.min(axis=0) - REACH_M) / terrain.cell_m + middle).astype(int).clip(0, len(terrain.heights) - 2)
-    high = np.ceil((path.max(axis=0) + REACH_M) / terrain.cell_m + middle).astype(int) + 1
-    heights = terrain.heights[low[0] : max(high[0], low[0] + 2), low[1] : max(high[1], low[1] + 2)]
-    x_m, y_m = ((low - middle) * terrain.cell_m).tolist()
-    rows, columns = heights.shape
-    return Ground(x_m, y_m, terrain.cell_m, rows, columns, _rounded(heights, 4))

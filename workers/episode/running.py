@@ -15,6 +15,7 @@ from t6gps.workers.episode.task import Course, one_direction, random_waypoints
 from t6gps.workers.ground.ground import ground
 from t6gps.workers.physics.engine import CONTROL_STEP_S, Engine, Unique
 from t6gps.workers.physics.observer import observe, survey
+from t6gps.workers.robot.state import RobotState
 from t6gps.workers.robot.support import SupportFrame, enter
 from t6gps.workers.settings import RolloutSettings
 
@@ -52,7 +53,7 @@ class RunningEpisode(Unique):
         )
         self.ground = ground(settings.terrain, terrain_seed, terrain_difficulty)
         engine.set_ground(self.ground)
-        self._engine = engine
+        self._engine, self._task = engine, task
         self._sensor_noise, bias = settings.randomisation.sensor_noise, settings.randomisation.sensor_bias
         if self._sensor_noise:
             self._sensor_rng = generator(seed, Stream.SENSORS)
@@ -77,6 +78,17 @@ class RunningEpisode(Unique):
         self._delayed.append(command)
         self.state = self._engine.control_step(self._delayed.popleft())
         self._step += 1
+        self._look(self.frame)
+
+    def head_for(self, x: float, y: float) -> None:
+        """Make this the only waypoint from now on (m)."""
+        self.course = Course(np.array([[x, y]]), self._task)
+        self._look(self.frame)
+
+    def move_to(self, state: RobotState, engine: Engine) -> None:
+        """Continue from another state, in an engine that has the episode's ground; past contacts are forgotten."""
+        engine.reset(state)
+        self._engine, self.state = engine, engine.state()
         self._look(self.frame)
 
     def _look(self, previous: SupportFrame | None) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import Awaitable, Callable, Iterable, Iterator
+from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -13,9 +13,13 @@ from queue import SimpleQueue
 from typing import Annotated, TypeAlias, cast, final
 
 from fastapi import Depends, HTTPException, Path, Request
+from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPBearer
 from pydantic import JsonValue
+from starlette.types import Receive, Send
+from starlette.types import Scope as ASGIScope
 
+from t6gps.service.driving.drives import Drives
 from t6gps.service.launch import job as records
 from t6gps.service.launch.job import Job
 from t6gps.service.remote.messages import Refusal, RunName, Scope
@@ -83,6 +87,24 @@ class Slots:
 
 
 @final
+class EventStream(StreamingResponse):
+    """A stream of server-sent events, which gives its slot back however it ends."""
+
+    media_type = "text/event-stream"
+
+    def __init__(self, events: AsyncIterator[str], slots: Slots) -> None:
+        super().__init__(events, headers={"Cache-Control": "no-store"})
+        self._slots = slots
+
+    async def __call__(self, scope: ASGIScope, receive: Receive, send: Send) -> None:
+        """Send it."""
+        try:
+            await super().__call__(scope, receive, send)
+        finally:
+            self._slots.give_back()
+
+
+@final
 class Shares:
     """Slots of which one token may have no more than so many."""
 
@@ -121,11 +143,15 @@ class Served:
     """What a server serves: a root, what lets a job train a run, what is listened to, and room for heavy work.
 
     query_s   that a query may take
+    drives    policies that somebody drives
+    holds     whether a token that was good still is
     """
 
     root: Folder
     launch: Launch
     query_s: float
+    drives: Drives
+    holds: Callable[[Token], bool]
     reading: Slots = field(default_factory=lambda: Slots(READING_N))
     copying: Slots = field(default_factory=lambda: Slots(COPYING_N))
     operating: Slots = field(default_factory=lambda: Slots(OPERATING_N))
@@ -172,8 +198,8 @@ def _changing(scope: Scope) -> Callable[..., dict[str, JsonValue]]:
     return note
 
 
-Reading, Administering = Depends(_asking(Scope.READ)), Depends(_asking(Scope.ADMIN))
-"""Of routes that change nothing."""
+Reading, Operating, Administering = (Depends(_asking(scope)) for scope in Scope)
+"""Of routes that change nothing that is kept."""
 Operation = Annotated[dict[str, JsonValue], Depends(_changing(Scope.OPERATE))]
 Administration = Annotated[dict[str, JsonValue], Depends(_changing(Scope.ADMIN))]
 """Of a route that changes something: what the audit shall say of it, beside who and when."""

@@ -2,19 +2,17 @@
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
 from typing import Annotated
 
 from fastapi import APIRouter, Header
 from fastapi.responses import StreamingResponse
 from starlette.concurrency import run_in_threadpool
-from starlette.types import Receive, Scope, Send
 
 from t6gps.service.remote.messages import CursorText
 from t6gps.service.remote.stream import START
 from t6gps.service.server import updates
 from t6gps.service.server.feed import Cursor
-from t6gps.service.server.routes.access import REFUSALS, Name, NamedRun, Place, Reading, Slots, contents, named
+from t6gps.service.server.routes.access import REFUSALS, EventStream, Name, NamedRun, Place, Reading, contents, named
 from t6gps.service.steering import events as happened
 from t6gps.service.steering import status as statuses
 from t6gps.service.steering.events import Event
@@ -65,20 +63,4 @@ async def events(
 ) -> StreamingResponse:
     """Live updates as server-sent events: iterations and events of the pool with their ids, changes of the status."""
     place.streams.take()
-    return _Stream(updates.stream(place.feeds, run, Cursor.of(last_event_id)), place.streams)
-
-
-class _Stream(StreamingResponse):
-    """A stream of events, which gives its slot back however it ends."""
-
-    media_type = "text/event-stream"
-
-    def __init__(self, events: AsyncIterator[str], slots: Slots) -> None:
-        super().__init__(events, headers={"Cache-Control": "no-store"})
-        self._slots = slots
-
-    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._slots.give_back()
+    return EventStream(updates.stream(place.feeds, run, Cursor.of(last_event_id)), place.streams)

@@ -20,7 +20,7 @@ from fastapi.responses import FileResponse, JSONResponse, Response, StreamingRes
 
 from t6gps.service.api import asking as questions
 from t6gps.service.launch.fetch import File, FolderSource
-from t6gps.service.remote.messages import WARNINGS, ColumnName, QueryForm, QueryRequest
+from t6gps.service.remote.messages import NUMBER_MOST, WARNINGS, ColumnName, QueryForm, QueryRequest
 from t6gps.service.server.routes.access import (
     REFUSALS,
     Answers,
@@ -43,7 +43,6 @@ from t6gps.storage.sql import query as sql
 routes = APIRouter(prefix="/v1/runs", dependencies=[Reading], responses=REFUSALS, tags=["read"])
 asking = APIRouter(dependencies=[Reading], responses=REFUSALS, tags=["read"])
 WARNINGS_N = 20
-NUMBER_MOST = 10**9
 CHUNK_BYTES_N = 2**18
 ARCHIVE = "application/octet-stream"
 MEDIA = {

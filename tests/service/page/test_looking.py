@@ -8,6 +8,7 @@ import json
 from collections.abc import Callable
 from pathlib import Path
 
+import no_webgl
 import numpy as np
 import pytest
 from axe_playwright_python.sync_playwright import Axe
@@ -23,10 +24,6 @@ PHONE = {"viewport": {"width": 390, "height": 800}, "has_touch": True, "is_mobil
 EPISODES = (
     "#/query?runs=tiny-*&sql=SELECT+run%2C+iteration%2C+episode_id%2C+cost+FROM+episodes+ORDER+BY+run%2C+episode_id"
 )
-NO_WEBGL = """const original = HTMLCanvasElement.prototype.getContext;
-HTMLCanvasElement.prototype.getContext = function (kind, ...more) {
-  return kind.startsWith("webgl") ? null : original.call(this, kind, ...more);
-};"""
 
 
 def nodes_of(server: Server, run: str, episode: int, step: int) -> np.ndarray:
@@ -89,7 +86,7 @@ def test_a_link_to_a_run_shows_its_curves_classes_and_episodes(visit: Opened) ->
     assert "run=tiny-0&episode=6" in page.url
 
 
-@pytest.mark.parametrize("script", ["", NO_WEBGL], ids=["webgl", "flat"])
+@pytest.mark.parametrize("script", ["", no_webgl.SCRIPT], ids=["webgl", "flat"])
 def test_the_robot_stands_where_the_stored_frame_has_it(visit: Opened, served: Server, script: str) -> None:
     page = visit("#/replay?run=tiny-0&episode=4&step=17", Scope.READ, script)
     expect(page.locator("output")).to_contain_text("step 17")

@@ -46,6 +46,10 @@ NEEDS = {
     ("POST", "/v1/runs/{name}/unpause"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/resume"): Scope.OPERATE,
     ("POST", "/v1/runs/{name}/stop"): Scope.OPERATE,
+    ("POST", "/v1/drives"): Scope.OPERATE,
+    ("POST", "/v1/drives/{drive}"): Scope.OPERATE,
+    ("DELETE", "/v1/drives/{drive}"): Scope.OPERATE,
+    ("GET", "/v1/drives/{drive}/frames"): Scope.READ,
     ("GET", "/v1/tokens"): Scope.ADMIN,
     ("POST", "/v1/tokens"): Scope.ADMIN,
     ("DELETE", "/v1/tokens/{token}"): Scope.ADMIN,
@@ -57,7 +61,9 @@ REFUSED = (401, 403)
 
 def status_of(http: httpx.Client, method: str, path: str) -> int:
     """The status of a request for a run that does not exist, so that nothing changes."""
-    with http.stream(method, path.format(name="none", figure="none.png", version=0, number=0, token="none")) as answer:
+    with http.stream(
+        method, path.format(name="none", figure="none.png", version=0, number=0, token="none", drive="none")
+    ) as answer:
         return answer.status_code
 
 

@@ -13,8 +13,8 @@ from schemathesis.generation import GenerationMode
 
 from t6gps.service.remote.messages import Scope
 
-ENDLESS = "/v1/runs/{name}/events"
-"""A stream has no end; its tests are in test_updates.py."""
+ENDLESS = ["/v1/runs/{name}/events", "/v1/drives/{drive}/frames"]
+"""A stream has no end; its tests are in test_updates.py and test_driving.py."""
 BEYOND = [schemathesis.checks.positive_data_acceptance]
 """Not asked: which settings and which SQL there are is beyond what a document can say."""
 EXAMPLES_N = int(os.environ.get("T6GPS_API_EXAMPLES", "8"))

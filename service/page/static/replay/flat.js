@@ -53,12 +53,14 @@ export function flat(place, episodes, letters) {
   };
 }
 
-function hills(pen, { ground }, x, y, scale) {
+/** The ground, lighter where it is higher. */
+export function hills(pen, { ground }, x, y, scale) {
   if (!ground) return;
   const height = heightOf(ground), { cell_m } = ground;
   for (let i = 0; i < ground.rows - 1; i += 1)
     for (let j = 0; j < ground.columns - 1; j += 1) {
       const left = ground.x_m + i * cell_m, low = ground.y_m + j * cell_m;
+      if (x(left + cell_m) < 0 || x(left) > pen.canvas.width || y(low) < 0 || y(low + cell_m) > pen.canvas.height) continue;
       const level = Math.min(Math.max(height(left + cell_m / 2, low + cell_m / 2) / 1.6 + 0.5, 0), 1);
       pen.fillStyle = `rgb(${Math.round(95 + 110 * level)} ${Math.round(125 + 70 * level)} ${Math.round(95 + 60 * level)})`;
       pen.fillRect(x(left), y(low + cell_m), cell_m * scale + 1, cell_m * scale + 1);
@@ -66,25 +68,39 @@ function hills(pen, { ground }, x, y, scale) {
 }
 
 function draw(pen, episode, nodes, row, shade, x, y, scale) {
-  const line = (points, style, width) => {
-    pen.strokeStyle = style;
-    pen.lineWidth = width;
-    pen.beginPath();
-    points.forEach(([px, py], k) => pen[k ? "lineTo" : "moveTo"](x(px), y(py)));
-    pen.stroke();
-  };
   const track = [];
-  for (let k = 0; k < episode.com_m.length; k += 3) track.push([episode.com_m[k], episode.com_m[k + 1]]);
-  line(track, colour("edge"), 1);
-  line(track.slice(0, row + 1), colour("cap"), 3);
-  const mark = waypointAt(episode, row), node = (k) => [nodes[3 * k], nodes[3 * k + 1]];
+  for (let k = 0; k < episode.com_m.length; k += 3) track.push([x(episode.com_m[k]), y(episode.com_m[k + 1])]);
+  line(pen, track, colour("edge"), 1);
+  line(pen, track.slice(0, row + 1), colour("cap"), 3);
+  circle(pen, waypointAt(episode, row), episode.waypoint_radius_m, colour("cap"), x, y, scale);
+  body(pen, episode, nodes, row, shade, x, y, scale);
+}
+
+/** A line of points of the canvas. */
+export function line(pen, points, style, width) {
+  pen.strokeStyle = style;
+  pen.lineWidth = width;
   pen.beginPath();
-  pen.arc(x(mark.x_m), y(mark.y_m), episode.waypoint_radius_m * scale, 0, 7);
+  points.forEach(([px, py], k) => pen[k ? "lineTo" : "moveTo"](px, py));
   pen.stroke();
+}
+
+/** The circle in which a waypoint is reached. */
+export function circle(pen, mark, radius_m, style, x, y, scale) {
+  pen.strokeStyle = style;
+  pen.lineWidth = 3;
+  pen.beginPath();
+  pen.arc(x(mark.x_m), y(mark.y_m), radius_m * scale, 0, 7);
+  pen.stroke();
+}
+
+/** A robot in a row: its triangle, cables and bars. */
+export function body(pen, episode, nodes, row, shade, x, y, scale) {
+  const node = (k) => [x(nodes[3 * k]), y(nodes[3 * k + 1])];
   pen.fillStyle = colour(["delta", "lambda"][episode.segments.find((span) => row < span.stop).kind]);
   pen.beginPath();
-  episode.faces[episode.face[row]].forEach((k, n) => pen[n ? "lineTo" : "moveTo"](x(node(k)[0]), y(node(k)[1])));
+  episode.faces[episode.face[row]].forEach((k, n) => pen[n ? "lineTo" : "moveTo"](...node(k)));
   pen.fill();
-  for (const [a, b] of episode.cables) line([node(a), node(b)], colour("faint-text"), 1);
-  for (const [a, b] of episode.bars) line([node(a), node(b)], shade, Math.max(2, 2 * episode.bar_radius_m * scale));
+  for (const [a, b] of episode.cables) line(pen, [node(a), node(b)], colour("faint-text"), 1);
+  for (const [a, b] of episode.bars) line(pen, [node(a), node(b)], shade, Math.max(2, 2 * episode.bar_radius_m * scale));
 }

@@ -11,16 +11,18 @@ import { picker } from "./pickers.js";
 import { timeline } from "./timeline.js";
 
 const NEWEST_MS = 3000;
+const NO_DRIVE = { drive: "", policies: "", friction: "", terrain: "", waypoint: "" };
 const RATES = ["0.25", "0.5", "1", "2", "4", "8"];
 
 export function open(place) {
   const left = new AbortController();
   const names = h("datalist", { id: "replay-runs" });
-  const first = picker("A", (chosen) => go({ ...chosen, newest: "", step: "" }), names);
+  const first = picker("A", (chosen) => go({ ...NO_DRIVE, ...chosen, newest: "", step: "" }), names);
   const second = picker("B, beside it", ({ run, episode, evaluation }) => go({ run2: run, episode2: episode, evaluation2: evaluation }), names);
   const beside = h("button", { type: "button", onclick: () => (second.element.hidden ? go({ run2: wanted.run, episode2: Number(wanted.episode || 0) + 1 }) : go({ run2: "", episode2: "", evaluation2: "" })) });
   const newest = h("button", { type: "button", onclick: () => go(wanted.newest ? { newest: "", episode: loaded[0]?.episode } : { newest: 1, episode: "", evaluation: "" }) }, "Newest, as they come");
-  const said = h("div"), stages = h("div", { class: "stages" }), lines = h("div", { class: "lines" }), numbers = h("div");
+  const wheel = h("button", { type: "button", class: "main", onclick: () => go({ drive: "new", newest: "", episode: loaded[0].episode, run2: "", episode2: "", evaluation2: "" }) }, "Drive it yourself");
+  const said = h("div"), cockpit = h("div", { class: "drive" }), stages = h("div", { class: "stages" }), lines = h("div", { class: "lines" }), numbers = h("div");
   const play = h("button", { type: "button", class: "main play", onclick: () => time.play(!time.state.playing) });
   const scrub = h("input", { type: "range", class: "scrub", min: 0, max: 0, step: 1, value: 0, "aria-label": "Step", oninput: () => (time.play(false), time.set(Number(scrub.value) * step_s())) });
   const rate = select(RATES.map((value) => [value, `${value} ×`]), { value: "1", onchange: () => (note({ rate: rate.value === "1" ? "" : rate.value }), (time.state.rate = Number(rate.value))) });
@@ -29,7 +31,7 @@ export function open(place) {
   const details = h("details", { ontoggle: () => (told = -1) }, h("summary", {}, "Numbers at this step"), numbers);
   const transport = h("div", { class: "transport", role: "group", "aria-label": "Replay" }, play, button("Step back", -1), button("Step on", 1), h("label", {}, "Speed", rate), h("label", {}, follow, "Follow"),
     h("button", { type: "button", onclick: () => views.forEach((one) => one.view.look()) }, "Reset view"), output);
-  let wanted = {}, loaded = [], views = [], rows = [], told = -1, asked = 0;
+  let wanted = {}, drive = null, loaded = [], views = [], rows = [], told = -1, asked = 0;
   const time = clock(shown, (playing) => {
     fill(play, playing ? "❚❚ Pause" : "▶ Play");
     if (playing || !loaded.length) return;
@@ -39,7 +41,8 @@ export function open(place) {
   });
   const step_s = () => (loaded[0]?.time_s.length > 1 ? loaded[0].time_s[1] : 0.1);
   time.play(false);
-  fill(place, h("h1", { class: "hidden" }, "Replay"), names, h("div", { class: "pickers" }, first.element, second.element, beside, newest), said, stages, lines, scrub, transport, details);
+  fill(place, h("h1", { class: "hidden" }, "Replay"), names, h("div", { class: "pickers" }, first.element, second.element, beside, newest, wheel), said, stages, lines, scrub, transport, details, cockpit);
+  wheel.hidden = true; // before there is an episode
   place.addEventListener("keydown", keys);
   get("/v1/runs", left.signal).then((runs) => fill(names, runs.map((run) => h("option", { value: run.name })))).catch(() => {}); // names are a convenience; the fields take any
 
@@ -53,7 +56,7 @@ export function open(place) {
   }
 
   function keys(event) {
-    if (event.target.matches("input:not([type=range], [type=checkbox]), select, textarea")) return;
+    if (drive || event.target.matches("input:not([type=range], [type=checkbox]), select, textarea")) return;
     const by = { ArrowLeft: -1, ArrowRight: 1, Home: -1e9, End: 1e9 }[event.key];
     if (by) by_steps(by * (event.shiftKey ? 10 : 1));
     else if (event.key === " " && !event.target.matches("button, summary, input")) time.play(!time.state.playing);
@@ -79,6 +82,21 @@ export function open(place) {
     follow.checked = values.follow !== "no";
     if (["run", "episode", "evaluation", "run2", "episode2", "evaluation2", "newest"].some((key) => values[key] !== before[key])) await load(false);
     else if (values.step !== undefined && loaded.length) time.set(Number(values.step) * step_s());
+    await driven(values);
+  }
+
+  /** Show a drive in the place of the replay, where the address says so. */
+  async function driven(values) {
+    const whether = Boolean(values.drive) && loaded.length > 0;
+    for (const part of [said, stages, lines, scrub, transport, details]) part.hidden = whether;
+    wheel.hidden = whether || !loaded.length;
+    if (drive && (!whether || drive.episode !== loaded[0])) drive.view.close(), (drive = null);
+    if (!whether) return;
+    time.play(false);
+    const { open: begin } = await import("../drive/view.js");
+    if (wanted !== values || left.signal.aborted) return;
+    drive ??= { episode: loaded[0], view: begin(cockpit, loaded[0], () => go(NO_DRIVE)) };
+    drive.view.update(values);
   }
 
   async function load(playing) {
@@ -170,6 +188,7 @@ export function open(place) {
 
   return { update, close() {
     left.abort();
+    drive?.view.close();
     time.close();
     views.forEach((one) => one.view.close());
     rows.forEach((line) => line.close());

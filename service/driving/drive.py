@@ -1,0 +1,204 @@
+"""A drive as its owner has it: the process that simulates, who looks, and why it ends.
+
+Whoever looks is told, as KIND and JSON: the scene, frames, `steered` with a command of somebody, and `end` with a
+sentence. Who is slow misses frames, and nothing else.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+import sys
+from collections import deque
+from collections.abc import AsyncIterator, Callable, Iterator
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import NamedTuple, final
+
+from t6gps.service.driving import process
+from t6gps.service.driving.commands import Command
+from t6gps.service.driving.order import Order
+from t6gps.storage.errors import ConfigError
+
+WAITING_N = 20
+"""Frames that wait for somebody slow: two seconds."""
+LONGEST_LINE_N = 2**23
+"""The ground of 100 m has 0.4 MB."""
+_ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
+
+
+@dataclass(frozen=True)
+class Patience:
+    """How long a drive goes on (s): with nobody who looks, and at most. `look_s` is how often that is seen to."""
+
+    alone_s: float = 10.0
+    longest_s: float = 1800.0
+    look_s: float = 0.5
+
+
+class News(NamedTuple):
+    """What somebody is told: a kind, and JSON."""
+
+    kind: str
+    text: str
+
+
+@final
+class Watch:
+    """What somebody who looks has not been told yet."""
+
+    def __init__(self) -> None:
+        self._waiting, self._some = deque[News](), asyncio.Event()
+
+    def put(self, news: News) -> None:
+        """Tell something; where too much waits, the oldest frame is forgotten."""
+        if len(self._waiting) >= WAITING_N:
+            oldest = next((k for k, one in enumerate(self._waiting) if one.kind == "frame"), 0)
+            del self._waiting[oldest]
+        self._waiting.append(news)
+        self._some.set()
+
+    async def news(self, alive_s: float) -> AsyncIterator[News | None]:
+        """What is told, up to `end`; None where nothing was for so long."""
+        while True:
+            while self._waiting:
+                news = self._waiting.popleft()
+                yield news
+                if news.kind == "end":
+                    return
+            self._some.clear()
+            try:
+                await asyncio.wait_for(self._some.wait(), alive_s)
+            except TimeoutError:
+                yield None
+
+
+@final
+class Drive:
+    """One drive. `holds` is false once whoever began it may do so no more; `ended` is called at its end."""
+
+    def __init__(self, order: Order, patience: Patience, holds: Callable[[], bool], ended: Callable[[], None]) -> None:
+        self._order, self._patience, self._holds, self._ended = order, patience, holds, ended
+        self._watches: set[Watch] = set()
+        self._scene: News | None = None
+        self._last: News | None = None
+        self._end: str | None = None
+        self._asked = asyncio.Queue[Command]()
+        self._task = asyncio.create_task(self._live())
+
+    @property
+    def robots_n(self) -> int:
+        """How many robots there are."""
+        return len(self._order.entrants)
+
+    def obey(self, command: Command) -> None:
+        """Let the simulation do what a command says, and tell everybody. ConfigError for what it cannot."""
+        order = self._order
+        if command.push is not None and command.push.robot >= self.robots_n:
+            raise ConfigError(f"there are {self.robots_n} robots, counted from 0; robot {command.push.robot} is none")
+        if command.terrain_difficulty is not None:
+            order = order.at(command.terrain_difficulty)
+        half_m = order.half_size_m
+        if command.waypoint_m is not None and half_m is not None and max(map(abs, command.waypoint_m)) >= half_m:
+            raise ConfigError(
+                f"the waypoint ({', '.join(f'{value:.1f}' for value in command.waypoint_m)}) lies beyond the ground, "
+                f"which reaches {half_m:.0f} m from its middle; choose a nearer one"
+            )
+        self._order = order
+        self._asked.put_nowait(command)
+        self._tell(News("steered", command.model_dump_json(exclude_none=True)))
+
+    @contextmanager
+    def watched(self) -> Iterator[Watch]:
+        """Look; the scene and the newest frame are told at once, if there are any yet."""
+        watch = Watch()
+        for news in (self._scene, self._last):
+            if news is not None:
+                watch.put(news)
+        self._watches.add(watch)
+        try:
+            yield watch
+        finally:
+            self._watches.discard(watch)
+
+    async def end(self, reason: str) -> None:
+        """End it, for a reason that those who look are told; return when its process is gone."""
+        self._end = self._end or reason
+        self._task.cancel()
+        with suppress(asyncio.CancelledError):
+            await self._task
+
+    async def _live(self) -> None:
+        try:
+            await self._simulate()
+        except* _Over as over:
+            self._end = self._end or str(over.exceptions[0])
+        except* OSError as failed:
+            self._end = f"no process can be started for the drive: {failed.exceptions[0]}; try again later"
+        finally:
+            self._ended()
+            self._tell(News("end", json.dumps(self._end or "the server stops; begin another drive when it is back")))
+
+    async def _simulate(self) -> None:
+        simulation = await asyncio.create_subprocess_exec(
+            *(sys.executable, "-P", "-m", process.__name__),
+            stdin=asyncio.subprocess.PIPE,
+            stdout=asyncio.subprocess.PIPE,
+            limit=LONGEST_LINE_N,
+            cwd="/",
+            env={**os.environ, **_ENVIRONMENT},
+        )
+        try:
+            orders, told = simulation.stdin, simulation.stdout
+            assert orders is not None
+            assert told is not None
+            orders.write(process.written(self._patience.longest_s, self._order))
+            async with asyncio.TaskGroup() as tasks:
+                tasks.create_task(self._relay(told))
+                tasks.create_task(self._pass_on(orders))
+                tasks.create_task(self._see_to_it())
+        finally:
+            simulation.kill()
+            await simulation.wait()
+
+    async def _relay(self, source: asyncio.StreamReader) -> None:
+        while line := await source.readline():
+            kind, _, text = line.decode().rstrip().partition(" ")
+            news = News(kind, text)
+            if kind == "end":
+                raise _Over(json.loads(text))
+            if kind == "scene":
+                self._scene = news
+            else:
+                self._last = news
+            self._tell(news)
+        raise _Over("the simulation has ended, and the server's log says why; begin another drive")
+
+    async def _pass_on(self, sink: asyncio.StreamWriter) -> None:
+        with suppress(ConnectionError):  # it has ended, which the other pipe says, too
+            while True:
+                sink.write((await self._asked.get()).model_dump_json().encode() + b"\n")
+                await sink.drain()
+
+    async def _see_to_it(self) -> None:
+        clock, patience = asyncio.get_running_loop().time, self._patience
+        began_s = seen_s = clock()
+        while True:
+            await asyncio.sleep(patience.look_s)
+            if self._watches:
+                seen_s = clock()
+            if not self._holds():
+                raise _Over("the token that began this drive is revoked or has expired; begin another drive")
+            if clock() - seen_s > patience.alone_s:
+                raise _Over("nobody looked any more; begin another drive")
+            if clock() - began_s > patience.longest_s:
+                raise _Over(f"a drive lasts {patience.longest_s / 60:.0f} minutes at most; begin another one")
+
+    def _tell(self, news: News) -> None:
+        for watch in self._watches:
+            watch.put(news)
+
+
+class _Over(Exception):
+    """Why a drive ends."""
