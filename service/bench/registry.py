@@ -8,14 +8,10 @@ import json
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
-from typing import TYPE_CHECKING
 
 from t6gps.service.provenance import Provenance, provenance
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
-
-if TYPE_CHECKING:
-    from t6gps.service.bench.rounds import Say
 
 BENCHMARKS = {
     "learner": "t6gps.service.bench.learner",

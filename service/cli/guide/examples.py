@@ -46,6 +46,15 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export minari": ("t6gps export minari rolling --run rough-quick --where 'iteration >= 5'",),
     "export rllib": ("t6gps export rllib rolling --run rough-quick",),
     "export parquet": ("t6gps export parquet rolling --where 'episodes.cost < 3'",),
+    "policy": ("t6gps policy export rough-quick --format onnx", "t6gps policy run rough-quick.onnx --episodes 8"),
+    "policy export": (
+        "t6gps policy export rough-quick --format c",
+        "t6gps policy export rough-quick --version 7 --format onnx --out walker.onnx",
+    ),
+    "policy run": (
+        "t6gps policy run walker.onnx --episodes 8 --seed 7",
+        "t6gps policy run walker.onnx --set robot.friction=0.5 --json",
+    ),
     "verify": ("t6gps verify", "t6gps verify rough-quick flat-quick --json"),
     "repair": ("t6gps repair rough-quick", "t6gps repair rough-quick --from copies/rough-quick"),
     "cp": ("t6gps cp rough-quick before", "t6gps cp rough-quick rough-quick --to s3://lab/runs"),
