@@ -73,10 +73,10 @@ def test_a_policy_is_driven_by_clicks_drags_and_keys_and_raced(visit: Opened, se
     drive = page.url
     second = visit(drive.partition("/#")[2].join(["#", ""]), Scope.OPERATE)
     expect(second.get_by_role("region", name="Robots").locator("tbody tr")).to_have_count(2)
-    slider = second.get_by_label("Terrain")
+    slider = second.get_by_role("slider", name="Terrain")
     slider.fill("0.8")
     expect(page.get_by_text("Somebody else with this token has changed terrain difficulty")).to_be_visible()
-    expect(page.get_by_label("Terrain")).to_have_value("0.8")
+    expect(page.get_by_role("slider", name="Terrain")).to_have_value("0.8")
     for scheme in ("light", "dark"):
         page.emulate_media(color_scheme=scheme)
         found = Axe().run(page, options={"runOnly": ["wcag2a", "wcag2aa", "wcag21a", "wcag21aa", "wcag22aa"]})
