@@ -14,7 +14,7 @@ export OMP_NUM_THREADS = 1
 export OPENBLAS_NUM_THREADS = 1
 export MKL_NUM_THREADS = 1
 
-.PHONY: install train test test-soak test-others test-fast view check bench bench-libraries fuzz soak clean
+.PHONY: install train test test-fast view check bench bench-libraries fuzz soak clean
 
 install: $(STAMP)
 
@@ -28,13 +28,8 @@ train: install
 
 # All tests, some 25 minutes on two cores; then those that need neither Ray nor a trained run, four and a half.
 test: install
-	$(MAKE) --no-print-directory --jobs=2 test-soak test-others
-
-test-soak:
-	$(BIN)/pytest $(SOAK)
-
-test-others:
 	$(BIN)/pytest $(SPREAD) --ignore=$(SOAK)
+	$(BIN)/pytest $(SOAK)
 
 test-fast: install
 	$(BIN)/pytest $(SPREAD) -m "not slow and not ray"

@@ -25,6 +25,12 @@ TINY = (
     "learner.value_from=100",  # it takes longer than all else, in runs that tests make longer
 )
 """Its settings, beside those of flat-quick."""
+VALUED = (
+    "--set=learner.value_from=2",
+    "--set=learner.action_value.first_steps=20",
+    "--set=learner.action_value.steps=10",
+)
+"""Options of a run that an action value leads all the same, from the third iteration on."""
 
 
 @dataclass

@@ -11,7 +11,7 @@ unset T6GPS_SERVER # the run is trained here
 publish=()
 [ ! -e "$folder/publish" ] || publish=(--publish "$(< "$folder/publish")")
 
-t6gps train "$folder/config.toml" --run "${folder##*/}" --root "$root" --resume "${publish[@]}" < /dev/null &
+t6gps train "$folder/config.toml" --run "${folder##*/}" --root "$root" --resume ${publish[@]+"${publish[@]}"} < /dev/null &
 train=$!
 trap 'kill -TERM "$train"' TERM
 

@@ -19,6 +19,7 @@ _one_at_a_time = threading.Lock()
 def launch(run: Run, config: Config) -> str:
     """Let a job train what is missing of a run; the job's name. RunError where somebody trains it already."""
     with _one_at_a_time:
-        planned = submission.continuing(run, config)
-        (job,) = submission.submit(LocalLauncher(), Kind.LOCAL, Local(), run.name, [planned])
+        planned, launcher = submission.continuing(run, config), LocalLauncher()
+        launcher.check([planned])
+        (job,) = submission.submit(launcher, Kind.LOCAL, Local(), run.name, [planned])
     return job.name

@@ -47,4 +47,8 @@ def standing(run: Run) -> Published | None:
     except (OSError, ValidationError) as error:
         reason = " ".join(str(error).split())
         raise RunError(f"cannot read {path}: {reason}; resume the run with --publish, which writes it anew") from None
-    return {**written, "behind": max(0, publishing.iterations(run.path) - written["iterations"])}
+    try:
+        committed_n = publishing.iterations(run.path)
+    except RunError:  # its newest commit is torn, which who reads its tables is told
+        committed_n = written["iterations"]
+    return {**written, "behind": max(0, committed_n - written["iterations"])}

@@ -106,8 +106,11 @@ def _tell_left(run: Run, root: ObjectPath) -> None:
         known = published.standing(run)
     except RunError:  # the command below finds out
         known = None
-    all_n = publishing.iterations(run.path)
-    there_n = all_n - known["behind"] if known else 0
+    try:
+        all_n = str(publishing.iterations(run.path))
+    except RunError:
+        all_n = "unknown"
+    there_n = known["iterations"] if known else 0
     reason = f": {known['error']}" if known and known["error"] else ""
     command = ["t6gps", "cp", run.name, run.name, "--root", str(run.path.parent), "--to", str(root)]
     what = f"{there_n} of {all_n} iterations, perhaps without checkpoint and evaluation"

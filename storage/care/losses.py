@@ -89,10 +89,11 @@ def _cut(draft: Run, table: str, first: int) -> None:
     folder = draft.tables / table
     for state in checkpoints.kept(folder / "_delta_log"):
         set_aside(draft, within(draft, state))
-    for commit in sorted((folder / "_delta_log").glob("*.json"), reverse=True):
-        number = _number(commit)
-        if number is None or number >= first:
-            set_aside(draft, within(draft, commit))
+    entries = sorted((folder / "_delta_log").glob("*.json"))
+    numbers = [_number(entry) for entry in entries]
+    end = next((k for k, number in enumerate(numbers) if number is None or number >= first), len(entries))
+    for commit in reversed(entries[end:]):  # with those that add no file: a log has no gaps
+        set_aside(draft, within(draft, commit))
     if not any((folder / "_delta_log").glob("*.json")):
         set_aside(draft, f"tables/{table}/_delta_log")
     for path in sorted(folder.glob("*.parquet")):

@@ -73,6 +73,8 @@ def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[
         if place in spoilt or not source.exists():
             continue
         if place.endswith("_delta_log"):
+            if _has_less(copy, draft, place):
+                continue  # the log is built anew from the files
             _take_table(draft, copy, place)
         else:
             set_aside(draft, place)
@@ -111,6 +113,12 @@ def _check_same(draft: Run, copy: Run, damaged: set[str]) -> None:
         raise RunError(
             "neither config.json nor origin.json of the run can be read, so no copy can be told to be its own"
         )
+
+
+def _has_less(copy: Run, draft: Run, place: str) -> bool:
+    """True where the log of a copy knows fewer files of a table than lie here."""
+    folder = Path(place).parent
+    return delta_files.opened(copy, folder.name).committed_n < len(list((draft.path / folder).glob("*.parquet")))
 
 
 def _take_table(draft: Run, copy: Run, place: str) -> None:

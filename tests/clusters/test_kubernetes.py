@@ -38,7 +38,7 @@ pytestmark = pytest.mark.skipif(
     any(shutil.which(program) is None for program in PROGRAMS) or os.geteuid() != 0,
     reason=f"pods of processes need root and the programs {', '.join(PROGRAMS)}",
 )
-LONG = [*tiny_run.settings(), "--set=run.iterations=8"]
+LONG = [*tiny_run.settings(), *tiny_run.VALUED, "--set=run.iterations=8"]
 ENDLESS = [*tiny_run.settings(), "--set=run.iterations=2000"]
 TARGET = """
 [k8s]

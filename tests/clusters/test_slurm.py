@@ -31,7 +31,7 @@ pytestmark = [
     ),
 ]
 
-LONG = [*tiny_run.settings(), "--set=run.iterations=20"]
+LONG = [*tiny_run.settings(), *tiny_run.VALUED, "--set=run.iterations=20"]
 """Long enough that a job can be interrupted after a checkpoint, and again after another one."""
 ENDS_S = 600.0
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import shutil
 from pathlib import Path
 
@@ -99,6 +100,15 @@ def test_a_run_whose_columns_have_come_is_checkpointed_and_mended_as_others_are(
     (old.tables / "frames" / "_delta_log" / f"{4:020d}.json").unlink()
     assert repair(old, None, verify).left == []
     assert {name: tables.read(old, name) for name in schema.TABLES} == rows
+
+
+@pytest.mark.parametrize("iteration", [0, 1, 2])
+def test_a_file_that_is_damaged_costs_what_follows_it_and_the_log_keeps_no_gap(old: Run, iteration: int) -> None:
+    go_on(old, 4)
+    (file,) = (old.tables / "frames").glob(f"*{iteration:06d}.parquet")
+    os.truncate(file, 100)
+    assert repair(old, None, verify).left == []
+    assert tables.committed_iterations(old) == iteration
 
 
 def test_columns_that_came_are_copied_in_their_turn(old: Run, objects: ObjectPath) -> None:

@@ -46,7 +46,10 @@ EXAMPLES: dict[str, tuple[str, ...]] = {
     "export minari": ("t6gps export minari rolling --run rough-quick --where 'iteration >= 5'",),
     "export rllib": ("t6gps export rllib rolling --run rough-quick",),
     "export parquet": ("t6gps export parquet rolling --where 'episodes.cost < 3'",),
-    "policy": ("t6gps policy export rough-quick --format onnx", "t6gps policy run rough-quick.onnx --episodes 8"),
+    "policy": (
+        "t6gps policy export rough-quick --format onnx --out walker.onnx",
+        "t6gps policy run walker.onnx --episodes 8",
+    ),
     "policy export": (
         "t6gps policy export rough-quick --format c",
         "t6gps policy export rough-quick --version 7 --format onnx --out walker.onnx",

@@ -43,15 +43,6 @@ def root(tiny: Trained) -> Path:
     return tiny.run.path.parent
 
 
-def test_the_command_line_loads_nothing_slow() -> None:
-    script = (
-        "import sys, t6gps.service.cli.main\n"
-        "print([name for name in ('torch', 'ray', 'matplotlib', 'sklearn') if name in sys.modules])"
-    )
-    found = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, check=True)
-    assert found.stdout == "[]\n"
-
-
 def test_train_prints_the_learning_curve_the_files_and_what_to_try_next(tiny: Trained) -> None:
     for word in ("forward m/s", "dataset", "checkpoints", "learning.png", "Try next", "t6gps eval tiny"):
         assert word in tiny.printed

@@ -18,7 +18,7 @@ from t6gps.storage import catalog
 CHROMIUM = shutil.which("chromium")
 needs_chromium = pytest.mark.skipif(CHROMIUM is None, reason="no chromium here: it is in Debian's package chromium")
 KEPT = "t6gps-token"
-PATIENCE_MS = 60_000
+PATIENCE_MS = 180_000
 SMALL = {"width": 1000, "height": 640}
 """Of the window: the processor draws it."""
 Opened = Callable[..., Page]

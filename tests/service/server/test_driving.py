@@ -25,7 +25,7 @@ from t6gps.storage.errors import ConfigError, DataError, RunError, ServerError
 from t6gps.storage.records import Episode, Learned, PolicySnapshot
 
 PATIENCE, BRIEF = Patience(alone_s=120.0, look_s=0.05), Patience(alone_s=0.2, look_s=0.05)
-LONG_S = 60
+LONG_S = 240
 
 
 def policy(version: int) -> PolicySnapshot:

@@ -149,7 +149,7 @@ def test_listeners_that_take_nothing_or_are_dead_hold_up_nobody(
 
 
 def test_a_client_that_takes_nothing_is_dropped(serve: Callable[..., Server], wait_until: Callable[..., None]) -> None:
-    server = serve(stalled_s=0.5)
+    server = serve(stalled_s=3.0)
     (server.run.figures / "large.png").write_bytes(b"\0" * 2**25)
     slow = listener(server, "/v1/runs/walk/figures/large.png")
     ports = urlsplit(server.url).port, slow.getsockname()[1]

@@ -58,6 +58,15 @@ def test_a_commit_that_was_altered_costs_nothing_where_its_file_is_as_it_was(wor
     assert {name: tables.read(worked, name) for name in schema.TABLES} == rows
 
 
+def test_a_copy_that_has_less_costs_no_iteration(worked: Run, tmp_path: Path, iterate: Any) -> None:
+    copy = catalog.copy(worked, tmp_path, "copy")
+    iterate(worked, 3)
+    rows = {name: tables.read(worked, name) for name in schema.TABLES}
+    alter(worked, "models", 1, next(iter(ALTERED.values())))
+    assert repair(worked, copy, verify).left == []
+    assert {name: tables.read(worked, name) for name in schema.TABLES} == rows
+
+
 def test_what_cannot_be_mended_is_set_aside_and_comes_again(worked: Run, iterate: Any, evaluate: Any) -> None:
     frames = tables.read(worked, "frames")
     os.truncate(worked.tables / "models" / "iteration-000001.parquet", 100)

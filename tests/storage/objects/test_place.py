@@ -153,6 +153,7 @@ def test_the_extra_is_named_where_it_is_not_installed(objects: ObjectPath, monke
 
 def test_other_threads_go_on_while_a_store_does_not_answer(monkeypatch: pytest.MonkeyPatch) -> None:
     with socket.create_server(("127.0.0.1", 0)) as server:
+        server.settimeout(240)
         for name, value in (
             ("AWS_ENDPOINT_URL", f"http://127.0.0.1:{server.getsockname()[1]}"),
             ("AWS_ACCESS_KEY_ID", "key"),
