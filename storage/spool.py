@@ -61,6 +61,16 @@ def newest(folder: Path) -> Episode | None:
     return None
 
 
+def waiting(folder: Path, episode_id: int) -> Episode | None:
+    """An episode that waits in a run's spool, for who only looks; None where it does not."""
+    for path in folder.glob(f"iteration-*/episode-{episode_id:012d}.arrow"):
+        try:
+            return read(path)
+        except FileNotFoundError:  # committed meanwhile
+            continue
+    return None
+
+
 def _came(path: Path) -> float:
     """When a file came, -inf for one that has gone."""
     try:

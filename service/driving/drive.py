@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import asyncio
 import json
+import logging
 import os
 import sys
 from collections import deque
@@ -23,8 +24,9 @@ from t6gps.storage.errors import ConfigError
 
 WAITING_N = 20
 """Frames that wait for somebody slow: two seconds."""
-LONGEST_LINE_N = 2**23
-"""The ground of 100 m has 0.4 MB."""
+LONGEST_LINE_N = 2**25
+"""The finest ground of a file has 8 MB."""
+_log = logging.getLogger(__name__)
 _ENVIRONMENT = {"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MALLOC_ARENA_MAX": "2"}
 
 
@@ -83,6 +85,7 @@ class Drive:
         self._watches: set[Watch] = set()
         self._scene: News | None = None
         self._last: News | None = None
+        self._over: News | None = None
         self._end: str | None = None
         self._asked = asyncio.Queue[Command]()
         self._task = asyncio.create_task(self._live())
@@ -111,9 +114,9 @@ class Drive:
 
     @contextmanager
     def watched(self) -> Iterator[Watch]:
-        """Look; the scene and the newest frame are told at once, if there are any yet."""
+        """Look; the scene, the newest frame and the end are told at once, if there are any yet."""
         watch = Watch()
-        for news in (self._scene, self._last):
+        for news in (self._scene, self._last, self._over):
             if news is not None:
                 watch.put(news)
         self._watches.add(watch)
@@ -134,21 +137,27 @@ class Drive:
             await self._simulate()
         except* _Over as over:
             self._end = self._end or str(over.exceptions[0])
-        except* OSError as failed:
-            self._end = f"no process can be started for the drive: {failed.exceptions[0]}; try again later"
+        except* Exception:
+            _log.exception("a drive has failed")
+            self._end = self._end or "the drive has failed, and the server's log says why; begin another one"
         finally:
             self._ended()
-            self._tell(News("end", json.dumps(self._end or "the server stops; begin another drive when it is back")))
+            reason = self._end or "the server stops; begin another drive when it is back"
+            self._over = News("end", json.dumps(reason))
+            self._tell(self._over)
 
     async def _simulate(self) -> None:
-        simulation = await asyncio.create_subprocess_exec(
-            *(sys.executable, "-P", "-m", process.__name__),
-            stdin=asyncio.subprocess.PIPE,
-            stdout=asyncio.subprocess.PIPE,
-            limit=LONGEST_LINE_N,
-            cwd="/",
-            env={**os.environ, **_ENVIRONMENT},
-        )
+        try:
+            simulation = await asyncio.create_subprocess_exec(
+                *(sys.executable, "-P", "-m", process.__name__),
+                stdin=asyncio.subprocess.PIPE,
+                stdout=asyncio.subprocess.PIPE,
+                limit=LONGEST_LINE_N,
+                cwd="/",
+                env={**os.environ, **_ENVIRONMENT},
+            )
+        except OSError as failed:
+            raise _Over(f"no process can be started for the drive: {failed}; try again later") from None
         try:
             orders, told = simulation.stdin, simulation.stdout
             assert orders is not None
@@ -159,7 +168,8 @@ class Drive:
                 tasks.create_task(self._pass_on(orders))
                 tasks.create_task(self._see_to_it())
         finally:
-            simulation.kill()
+            with suppress(ProcessLookupError):  # it has ended by itself
+                simulation.kill()
             await simulation.wait()
 
     async def _relay(self, source: asyncio.StreamReader) -> None:

@@ -31,11 +31,15 @@ class Drives:
         self._patience = patience
         self._drives: dict[str, Steered] = {}
 
-    def begin(self, order: Order, token: str, name: str, holds: Callable[[], bool]) -> str:
-        """Begin a drive for a token; its identifier. ServerError where there are as many as may be."""
+    def check_room(self) -> None:
+        """ServerError where there are as many drives as may be."""
         if len(self._drives) >= DRIVES_MOST_N:
             names = " and ".join(sorted(one.name for one in self._drives.values()))
             raise ServerError(f"{DRIVES_MOST_N} drives are under way, by {names}, and no more may be; end one first")
+
+    def begin(self, order: Order, token: str, name: str, holds: Callable[[], bool]) -> str:
+        """Begin a drive for a token; its identifier. ServerError where there are as many as may be."""
+        self.check_room()
         identity = secrets.token_hex(8)
         drive = Drive(order, self._patience, holds, lambda: self._forget(identity))
         self._drives[identity] = Steered(drive, token, name)

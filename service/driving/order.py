@@ -63,8 +63,8 @@ def entrant(run: Run, version: int | None, evaluation_id: int | None = None) -> 
 
 def start(run: Run, number: int, evaluation_id: int | None, difficulty: float) -> Start:
     """Where an episode of a run began, also one that waits for its iteration. DataError where there is none."""
-    newest = spool.newest(run.spool) if evaluation_id is None else None
-    found = newest if newest is not None and newest.episode_id == number else tables.episode(run, number, evaluation_id)
+    waits = spool.waiting(run.spool, number) if evaluation_id is None else None
+    found = tables.episode(run, number, evaluation_id) if waits is None else waits
     seed, terrain_seed, index = (found.summary[name][0].as_py() for name in ("seed", "terrain_seed", "index"))
     return Start(seed, terrain_seed, difficulty, index)
 

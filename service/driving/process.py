@@ -74,18 +74,22 @@ def written(longest_s: float, order: Order) -> bytes:
 def drive(field: Field, lines: Lines, tell: Tell) -> None:
     """Let robots move as lines command, and tell what is seen. What comes during a step acts after it."""
     _tell(tell, field.scene(), field.frame())
-    due_s, asked = time.monotonic() + CONTROL_STEP_S, None
+    due_s, asked, is_other = time.monotonic() + CONTROL_STEP_S, None, False
     while True:
         wait_s = None if field.paused and asked is None else max(due_s - time.monotonic(), 0.0)
         line = lines.next(wait_s)
         if line is not None:
             command = Command.model_validate_json(line)
+            if asked is not None and asked.push is not None and command.push is not None:
+                is_other |= field.obey(asked)  # each push acts
+                asked = None
             asked = command if asked is None else command.after(asked)
             continue
-        is_other = asked is not None and field.obey(asked)
-        asked = None
+        if asked is not None:
+            is_other |= field.obey(asked)
         field.step()
         _tell(tell, field.scene() if is_other else None, field.frame())
+        asked, is_other = None, False
         due_s = max(due_s + CONTROL_STEP_S, time.monotonic())  # time that was lost stays lost
 
 

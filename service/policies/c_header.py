@@ -7,7 +7,6 @@ from __future__ import annotations
 
 import ctypes
 import hashlib
-import json
 import re
 import shutil
 import subprocess
@@ -137,7 +136,8 @@ def compiled(file: Path, source: str, name: str) -> Callable[..., None]:
         )
     with tempfile.TemporaryDirectory(prefix="t6gps-") as folder:
         text, library = Path(folder, "policy.c"), Path(folder, "policy.so")
-        text.write_text(source.format(json.dumps(str(file.resolve()))[1:-1]))
+        shutil.copyfile(file, Path(folder, "policy.h"))  # a name that every compiler reads
+        text.write_text(source.format("policy.h"))
         done = subprocess.run(
             [compiler, *OPTIONS, str(text), "-o", str(library), "-lm"], capture_output=True, text=True, check=False
         )

@@ -27,7 +27,7 @@ class Driving:
 
         `more` has the other fields of DriveRequest.
         """
-        wanted = [DriveEntry(run=run, version=version) for run, version in entries]
+        wanted = [checked(DriveEntry, run=run, version=version) for run, version in entries]
         request = checked(DriveRequest, entries=wanted, episode=episode, **more)
         return self.server.post("/drives", DriveBegun, request).id
 

@@ -49,13 +49,15 @@ UnderWay = Annotated[Steered, Depends(_drive)]
 async def begin(operation: Operation, request: DriveRequest, place: Place, asker: Asker) -> DriveBegun:
     """Let policies run in the simulator; it ends when nobody looks for ten seconds."""
     operation.update(request.model_dump())
+    place.drives.check_room()  # before much is read
 
     def wanted() -> Order:
         first, *others = ((named(place, entry.run), entry.version) for entry in request.entries)
-        leader = orders.entrant(*first, request.evaluation)
-        entrants = [leader, *(orders.entrant(*other) for other in others)]
-        difficulty = leader.settings.terrain.difficulty
-        began = orders.start(first[0], request.episode, request.evaluation, difficulty)
+        with place.reading.taken():
+            leader = orders.entrant(*first, request.evaluation)
+            entrants = [leader, *(orders.entrant(*other) for other in others)]
+            difficulty = leader.settings.terrain.difficulty
+            began = orders.start(first[0], request.episode, request.evaluation, difficulty)
         return orders.order(entrants, began, request.terrain_difficulty, request.friction)
 
     order = await run_in_threadpool(wanted)

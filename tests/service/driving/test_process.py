@@ -3,15 +3,20 @@
 from __future__ import annotations
 
 import json
+import os
 import subprocess
 import sys
+from contextlib import closing
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
+import pytest
 
 from t6gps.service import config as configuration
 from t6gps.service.driving import process
-from t6gps.service.driving.commands import Command
+from t6gps.service.driving.commands import Command, Push
+from t6gps.service.driving.field import Field
 from t6gps.service.driving.order import Entrant, Order, order
 from t6gps.storage import schema
 from t6gps.storage.records import PolicySnapshot
@@ -52,6 +57,26 @@ def test_a_robot_that_cannot_be_driven_is_the_end_with_a_reason() -> None:
     told = simulated(order([entrant("a", weight=float("nan"))], START, None, None))
     assert told[-1][0] == "end"
     assert "must hold finite float32 numbers" in str(told[-1][1])
+
+
+def test_each_of_two_pushes_within_a_step_acts() -> None:
+    reader, writer = os.pipe()
+    for robot, impulse_n_s in enumerate(([20.0, 0.0, 0.0], [0.0, 20.0, 0.0])):
+        push = Push(robot=robot, impulse_n_s=impulse_n_s)
+        os.write(writer, Command(push=push).model_dump_json().encode() + b"\n")
+    frames: list[dict[str, Any]] = []
+
+    def tell(kind: str, data: Any) -> None:
+        frames.extend([data] if kind == "frame" else [])
+        if len(frames) == 2:
+            os.close(writer)
+
+    with closing(Field(order([entrant("a"), entrant("b")], START, None, None))) as field, pytest.raises(EOFError):
+        process.drive(field, process.Lines(reader), tell)
+    os.close(reader)
+    a, b = (np.array(robot["com_m"]) for robot in frames[1]["robots"])
+    assert (a - b)[0] > 0.02
+    assert (b - a)[1] > 0.02
 
 
 def test_who_races_brings_its_robot_onto_the_ground_of_the_first() -> None:

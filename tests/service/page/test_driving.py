@@ -56,7 +56,8 @@ def test_a_policy_is_driven_by_clicks_drags_and_keys_and_raced(visit: Opened, se
     page.mouse.move(box["x"] + box["width"] / 2, box["y"] + box["height"] / 2)
     page.mouse.down()
     page.mouse.move(box["x"] + 0.9 * box["width"], box["y"] + box["height"] / 2, steps=5)
-    page.mouse.up()
+    with page.expect_request(lambda asked: asked.method == "POST" and '"push"' in (asked.post_data or "")):
+        page.mouse.up()
     page.wait_for_function(
         "([x, y]) => { const [a, b] = document.querySelector('.entrants tbody td:nth-child(3)').textContent"
         ".replaceAll('\u2212', '-').split(', '); return Math.hypot(a - x, b - y) > 0.5; }",

@@ -50,8 +50,9 @@ export function solid(place, robots) {
   }
 
   function trail(part, k) {
-    if (part.one.trail.length === part.trail_n || part.one.trail.length < 2) return;
-    part.trail_n = part.one.trail.length;
+    const newest = part.one.trail.at(-1);
+    if (newest === part.newest || part.one.trail.length < 2) return;
+    part.newest = newest;
     dispose(part.way);
     part.way.add(band(evened(part.one.trail), height, TRAIL_M, new THREE.MeshBasicMaterial({ color: colour(k ? SHADES[k] : "cap"), side: THREE.DoubleSide, transparent: true, opacity: 0.8 })).mesh);
   }

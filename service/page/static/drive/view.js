@@ -25,28 +25,38 @@ export function open(place, episode, leave) {
     h("li", {}, "A click on the ground sets the waypoint. A drag from a robot pushes it. A drag elsewhere turns the view."),
     h("li", {}, "With the scene in focus, arrows move the waypoint by half a metre, as one sees it. Shift and an arrow push robot A."),
     h("li", {}, "Space pauses, and Home starts again.")));
-  let wanted = {}, drive = null, watching = null, found = [], ground = null, raised = null, stage = null, pace = null, frame_n = 0, told_ms = 0, drawn_s = null;
+  let wanted = {}, drive = null, own = null, watching = null, found = [], ground = null, raised = null, stage = null, pace = null, frame_n = 0, begun_n = 0, told_ms = 0, drawn_s = null;
   fill(place, h("p", { class: "count" }, `Seed and ground of episode ${episode.episode} of ${episode.run}. `, h("button", { type: "button", class: "quiet", onclick: leave }, "Back to the replay")), said, stages, panel.element, racers.element, help);
   frame_n = requestAnimationFrame(tick);
 
   async function begin(values) {
-    watching?.abort();
-    const before = drive;
-    drive = ground = null;
+    const mine = (begun_n += 1), before = drive, overtaken = () => mine !== begun_n || left.signal.aborted;
+    forget();
+    drive = null;
     fill(said, empty("Starting the simulator …"));
     try {
-      if (before) await ended(before);
+      if (before && before === own) await ended(before);
       const entries = values.policies ? read(values.policies) : [{ run: episode.run, version: await acting(episode, left.signal) }];
+      if (overtaken()) return;
       wanted = { ...values, policies: written(entries) };
       racers.show(entries);
       const other = (value) => (value === undefined ? null : Number(value));
       const { id } = await post("/v1/drives", { entries, episode: episode.episode, evaluation: episode.evaluation, friction: other(values.friction), terrain_difficulty: other(values.terrain) });
-      drive = id;
+      if (overtaken()) return void (await ended(id));
+      drive = own = id;
       noted({ drive: id });
       look(values.waypoint);
     } catch (error) {
-      if (!left.signal.aborted) fill(said, fault(error.message), again());
+      if (!overtaken()) fill(said, fault(error.message), again());
     }
+  }
+
+  /** See nothing more of what was seen. */
+  function forget() {
+    watching?.abort();
+    stage?.close();
+    stage = raised = ground = null;
+    found = [];
   }
 
   /** Let the address say it, so that it begins such a drive where this one has ended. */
@@ -92,6 +102,7 @@ export function open(place, episode, leave) {
     fill(stages, place);
     fill(said, solid ? null : empty("This browser draws nothing in three dimensions (WebGL), so that the robot is seen from above."));
     raised = () => (solid ?? plain)(place, mine);
+    if (mine.every((one) => one.now)) raise(); // its first frame has come meanwhile, and a pause brings no other
   }
 
   function frame(data) {
@@ -184,7 +195,7 @@ export function open(place, episode, leave) {
       wanted = { policies: values.policies, friction: values.friction, terrain: values.terrain, waypoint: values.waypoint };
       if (drive && values.drive === drive) return;
       if (values.drive === "new") begin(wanted);
-      else (drive = values.drive), look();
+      else forget(), (drive = values.drive), look();
     },
     close() {
       left.abort();
