@@ -74,11 +74,14 @@ def committed(run: Run) -> int:
     episodes = log.opened(run, "episodes")
     if episodes is not None:
         return log.committed(episodes)
-    for name in schema.OF_ITERATIONS:
-        others_n = log.committed(log.opened(run, name))
-        if others_n > 1:
-            raise log.damaged(run, "episodes", f"it is missing, and {name} has {others_n} iterations")
-    return 0
+    others = {name: log.committed(log.opened(run, name)) for name in schema.OF_ITERATIONS}
+    name = max(others, key=others.__getitem__)
+    if others[name] <= 1:
+        return 0
+    episodes = log.opened(run, "episodes")  # once more: iterations may have been committed meanwhile
+    if episodes is None:
+        raise log.damaged(run, "episodes", f"it is missing, and {name} has {others[name]} iterations")
+    return log.committed(episodes)
 
 
 def files(run: Run, table: str, iterations_n: int) -> Files:

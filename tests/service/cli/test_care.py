@@ -30,7 +30,7 @@ def test_sound_runs_are_said_to_be_and_a_damaged_one_is_named_with_the_file(root
     flip(root / "tiny" / file, 5000)
     done = t6gps("verify", "--root", root, code=2)
     assert "other: sound" in done.stdout.decode()
-    assert f"tiny: frames: {file}: it was altered" in done.stdout.decode()
+    assert f"tiny: frames: {file}: its SHA-256 is another than its log has" in done.stdout.decode()
     assert "Traceback" not in done.stderr
     runs = json.loads(t6gps("verify", "tiny", "--json", "--root", root, code=2).stdout)["runs"]
     assert [(fault["part"], fault["place"], fault["number"]) for fault in runs["tiny"]] == [("frames", file, 1)]
