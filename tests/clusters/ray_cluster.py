@@ -20,9 +20,7 @@ from pathlib import Path
 from urllib.request import Request, urlopen
 
 import yaml
-from deltalake import DeltaTable
 from house import START_ATTEMPTS_N
-from obstore.store import MemoryStore
 from ray_nodes import HEAD, PORT, ray_start
 from slurm_cluster import wait_until
 
@@ -89,12 +87,7 @@ class RayCluster:
 
     @contextmanager
     def inside(self) -> Iterator[None]:
-        """This thread, and those that it starts, live in the namespace meanwhile.
-
-        The storage libraries start threads at their first call, and keep them: they stay outside, for later tests.
-        """
-        DeltaTable.is_deltatable(str(self.folder))
-        MemoryStore().put("first", b"call")
+        """This thread, and those that it starts, live in the namespace meanwhile."""
         with Path("/proc/thread-self/ns/net").open() as outside, Path(f"/run/netns/{self.namespace}").open() as inside:
             _enter_namespace(inside.fileno())
             try:
