@@ -5,7 +5,7 @@ from __future__ import annotations
 import signal
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from pathlib import Path
 
@@ -19,6 +19,14 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
 DEADLINE_S = 60.0
+
+
+@pytest.fixture(autouse=True)
+def plain() -> Iterator[None]:
+    """Ctrl-C means KeyboardInterrupt and ends a wait, whatever other tests of this process have left."""
+    before = signal.signal(signal.SIGINT, signal.default_int_handler)
+    yield
+    signal.signal(signal.SIGINT, before or signal.default_int_handler)
 
 
 @pytest.fixture

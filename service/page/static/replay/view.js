@@ -167,9 +167,10 @@ export function open(place) {
 
   function tell(step, time_s) {
     told = step;
+    const row_s = (step * step_s()).toFixed(1);
     scrub.value = step;
-    scrub.setAttribute("aria-valuetext", `step ${step}, ${time_s.toFixed(1)} s`);
-    fill(output, `step ${step} · ${time_s.toFixed(1)} s`);
+    scrub.setAttribute("aria-valuetext", `step ${step}, ${row_s} s`);
+    fill(output, `step ${step} · ${row_s} s`);
     for (const { indices, tags } of views) indices.forEach((k, n) => fill(tags[n], words(loaded[k], k, time_s)));
     if (details.open) fill(numbers, views.flatMap(({ view, indices }) => indices.map((k, n) => positions(loaded[k], view.nodes(n)))));
   }
