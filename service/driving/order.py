@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import asdict, dataclass, replace
+
+import numpy as np
 
 from t6gps.service.training import evaluation_records, origin, policies
 from t6gps.storage import spool, tables
 from t6gps.storage.catalog import Run
+from t6gps.storage.delta import policies as policy_rows
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.records import PolicySnapshot
 from t6gps.workers.driving import Start
@@ -39,6 +43,28 @@ class Order:
         ends = self.start.terrain_difficulty > 0 or ground.tilt_deg > 0 or ground.file is not None
         return ground.size_m / 2 if ends else None
 
+    def to_json(self) -> str:
+        """The order on one line, for another process."""
+        entrants = [
+            {
+                "run": one.run,
+                "settings": one.settings.model_dump(mode="json"),
+                "policy": {name: np.asarray(value).tolist() for name, value in policy_rows.row(one.policy).items()},
+            }
+            for one in self.entrants
+        ]
+        return json.dumps({"entrants": entrants, "start": asdict(self.start), "friction": self.friction})
+
+    @classmethod
+    def of_json(cls, text: str) -> Order:
+        """The order that `to_json` has told. DataError for a policy that has not come whole."""
+        plain = json.loads(text)
+        entrants = [
+            Entrant(one["run"], one["policy"]["version"], _settings(one["settings"]), policy_rows.policy(one["policy"]))
+            for one in plain["entrants"]
+        ]
+        return cls(tuple(entrants), Start(**plain["start"]), plain["friction"])
+
     def at(self, terrain_difficulty: float) -> Order:
         """The same on another ground. ConfigError where the ground is that of a file."""
         if self.entrants[0].settings.terrain.file is not None:
@@ -46,6 +72,10 @@ class Order:
                 f"the ground of run {self.entrants[0].run} is that of a file, which no number makes steeper; leave it"
             )
         return replace(self, start=replace(self.start, terrain_difficulty=terrain_difficulty))
+
+
+def _settings(plain: object) -> RolloutSettings:
+    return RolloutSettings.model_validate_json(json.dumps(plain))
 
 
 def entrant(run: Run, version: int | None, evaluation_id: int | None = None) -> Entrant:

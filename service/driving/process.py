@@ -9,10 +9,8 @@ end with the reason. It ends with its input, so that it outlives no owner.
 
 from __future__ import annotations
 
-import base64
 import json
 import os
-import pickle
 import resource
 import select
 import signal
@@ -67,8 +65,8 @@ class Lines:
 
 
 def written(longest_s: float, order: Order) -> bytes:
-    """The line with which a drive begins."""
-    return base64.b64encode(pickle.dumps((longest_s, order))) + b"\n"
+    """The line with which a drive begins: JSON."""
+    return json.dumps({"longest_s": longest_s, "order": order.to_json()}).encode() + b"\n"
 
 
 def drive(field: Field, lines: Lines, tell: Tell) -> None:
@@ -114,9 +112,9 @@ def main() -> None:
     try:
         first = lines.next(None)
         assert first is not None
-        longest_s, order = pickle.loads(base64.b64decode(first))
-        limit(longest_s)
-        with closing(Field(order)) as field:
+        given = json.loads(first)
+        limit(given["longest_s"])
+        with closing(Field(Order.of_json(given["order"]))) as field:
             drive(field, lines, tell)
     except EOFError:
         return  # nobody commands any more
