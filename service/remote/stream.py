@@ -14,11 +14,11 @@ START = "0-0"
 
 @dataclass(frozen=True)
 class Update:
-    """Something that happened to a run.
+    """One event of a stream: something that happened to a run, or a frame of a drive.
 
-    kind   iteration, with a row of the table `iterations`; pool, with an event; status, with a status; fault, with a
-           sentence
-    id     where a stream may be resumed, so that each comes once; None for a status and a fault
+    kind   of a run: iteration, with a row of the table `iterations`; pool, with an event; status, with a status; fault,
+           with a sentence. Of a drive: scene, frame, steered, end (docs/server.md)
+    id     where a stream may be resumed, so that each comes once; None where it may not
     """
 
     kind: str

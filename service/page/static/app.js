@@ -41,14 +41,6 @@ function missing(place) {
 
 fill(document.getElementById("views"), Object.entries(VIEWS).map(([name, [title]]) => h("a", { href: to(name), "data-view": name }, title)));
 document.getElementById("leave").addEventListener("click", leave);
-document.getElementById("theme").addEventListener("click", () => {
-  const root = document.documentElement;
-  const dark = getComputedStyle(root).getPropertyValue("--is-dark").trim() === "1";
-  root.dataset.theme = dark ? "light" : "dark";
-  localStorage.setItem("t6gps-theme", root.dataset.theme);
-  window.dispatchEvent(new Event("themechange"));
-});
-matchMedia("(prefers-color-scheme: dark)").addEventListener("change", () => window.dispatchEvent(new Event("themechange")));
 onReachable((now) => fill(document.getElementById("connection"), now ? "" : "⚠ The server does not answer; asking again"));
 document.querySelector(".skip").addEventListener("click", (event) => {
   event.preventDefault(); // the address is that of the view

@@ -35,6 +35,7 @@ export function controls(ask, push, { look, follow, end }) {
   return {
     element, state,
     strength: () => Number(strength.value),
+    following: () => following.checked,
     /** What holds now, also where others have asked for it. */
     scene: (scene) => (friction.show(scene.friction), terrain.show(scene.terrain_difficulty)),
     frame(frame) {

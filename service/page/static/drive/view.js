@@ -119,6 +119,7 @@ export function open(place, episode, leave) {
   /** Draw, from the first frame of a scene on. */
   function raise() {
     stage = raised();
+    stage.follow(panel.following());
     stage.show(pace(found, performance.now()));
     stage.look();
     pointing(stage, { waypoint: (at) => ask({ waypoint_m: at.map(rounded) }), push: pushed, aimed: (n_s) => fill(said, n_s === null ? null : empty(`Push of ${n_s.toFixed(0)} N s`)) });
