@@ -47,6 +47,7 @@ class Turns:
 
     connection   to the process of the clients
     server       process of the server
+    clients      process of the clients
     """
 
     seconds: float
@@ -54,9 +55,12 @@ class Turns:
     say: Say
     connection: Connection
     server: int
+    clients: int
     tallies: dict[bool, list[Tally]] = field(default_factory=lambda: {False: [], True: []})
     latencies_s: list[float] = field(default_factory=list)
     server_s: float = 0.0
+    clients_s: float = 0.0
+    busy_s: float = 0.0
     settled_s: float = float("inf")
 
     def begin(self) -> None:
@@ -82,15 +86,20 @@ class Turns:
         self.settled_s = time.monotonic() + SETTLING_S
         if busy:
             self.connection.send(True)
-            self.server_s -= _cpu_s(self.server)
+            self._count(-1)
 
     def _end_clients(self) -> None:
-        self.server_s += _cpu_s(self.server)
+        self._count(1)
         self.connection.send(False)
         latencies_s, wrong = self.connection.recv()
         if wrong:
             raise RunError(f"the server answered {len(wrong)} clients wrongly, such as {wrong[0]}; see its log")
         self.latencies_s += latencies_s
+
+    def _count(self, sign: int) -> None:
+        self.server_s += sign * _cpu_s(self.server)
+        self.clients_s += sign * _cpu_s(self.clients)
+        self.busy_s += sign * time.monotonic()
 
 
 def server(say: Say, seconds: float = SECONDS, rounds: int = ROUNDS) -> dict[str, float | None]:
@@ -110,6 +119,7 @@ def measure(say: Say, seconds: float, rounds: int) -> dict[str, float | None]:
     status_p50_ms, status_p95_ms   from a request of the status to the whole answer
     pool_ratio                     the pool's control steps per second with clients over those without
     pool_steps_per_s               of the pool without clients
+    server_share, clients_share    processor time of either, by what all cores have in the turns with clients
     server_cpu_ms_per_status       processor time of the server for everything that it does, by statuses
     server_peak_mb                 the most memory that the server's process had at once
     """
@@ -120,8 +130,8 @@ def measure(say: Say, seconds: float, rounds: int) -> dict[str, float | None]:
         stack.enter_context(catalog.locked(run))
         (run.figures / LARGE).write_bytes(bytes(LARGE_BYTES))
         process, url, token = stack.enter_context(_serving(run.path.parent))
-        connection = stack.enter_context(_clients(url, token, run.name))
-        measured = Turns(seconds, rounds, say, connection, process)
+        connection, asking = stack.enter_context(_clients(url, token, run.name))
+        measured = Turns(seconds, rounds, say, connection, process, asking)
         measured.begin()
 
         def keep(episode: Episode) -> None:
@@ -139,11 +149,14 @@ def _figures(measured: Turns) -> dict[str, float | None]:
     quiet, busy, latencies_s = measured.tallies[False], measured.tallies[True], measured.latencies_s
     if len(busy) < measured.rounds or not latencies_s:
         raise RunError("the episodes ended before the turns did; measure for a shorter time")
+    cores_s = measured.busy_s * (os.cpu_count() or 1)
     return {
         "status_p50_ms": 1e3 * float(np.quantile(latencies_s, 0.5)),
         "status_p95_ms": 1e3 * float(np.quantile(latencies_s, 0.95)),
         "pool_ratio": turns.efficiency(busy, quiet),
         "pool_steps_per_s": turns.steps_per_s(quiet),
+        "server_share": measured.server_s / cores_s,
+        "clients_share": measured.clients_s / cores_s,
         "server_cpu_ms_per_status": 1e3 * measured.server_s / len(latencies_s),
     }
 
@@ -170,15 +183,16 @@ def _serving(root: Path) -> Iterator[tuple[int, str, str]]:
 
 
 @contextmanager
-def _clients(url: str, token: str, run: str) -> Iterator[Connection]:
-    """The process of the clients, by its end of a pipe."""
+def _clients(url: str, token: str, run: str) -> Iterator[tuple[Connection, int]]:
+    """A pipe to the process of the clients, and that process."""
     context = multiprocessing.get_context("spawn")
     here, there = context.Pipe()
     process = context.Process(target=clients, args=(there, url, token, run), daemon=True)
     process.start()
+    assert process.pid is not None  # it has started
     with closing(here):
         try:
-            yield here
+            yield here, process.pid
         finally:
             process.kill()
             process.join()

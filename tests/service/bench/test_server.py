@@ -20,6 +20,8 @@ def test_a_server_with_slow_and_dead_clients_is_measured_beside_a_pool(ray_head:
         "status_p95_ms",
         "pool_ratio",
         "pool_steps_per_s",
+        "server_share",
+        "clients_share",
         "server_cpu_ms_per_status",
         "server_peak_mb",
     }
