@@ -5,6 +5,7 @@ from __future__ import annotations
 import hashlib
 import os
 import platform
+import re
 import subprocess
 from collections.abc import Mapping
 from dataclasses import dataclass
@@ -12,6 +13,7 @@ from datetime import UTC, datetime
 from importlib import metadata, util
 from pathlib import Path
 
+from t6gps.service import threads
 from t6gps.storage.schema import SCHEMA_VERSION
 
 SHORT_N = 12
@@ -32,11 +34,17 @@ COMPILED = (
 
 @dataclass(frozen=True)
 class Provenance:
-    """What made a measurement, and when: the date is UTC in ISO 8601."""
+    """What made a measurement, and when: the date is UTC in ISO 8601.
+
+    processor   its name, and the bits of its widest vectors
+    blas        the processor that NumPy's BLAS computes for; another one rounds otherwise (docs/results.md)
+    """
 
     commit: str
     date: str
     platform: str
+    processor: str
+    blas: str
     cores: int
     versions: dict[str, str]
 
@@ -44,7 +52,18 @@ class Provenance:
 def provenance() -> Provenance:
     """Of what this process makes now."""
     now = datetime.now(UTC).isoformat(timespec="seconds")
-    return Provenance(commit(), now, platform.platform(), os.cpu_count() or 1, versions())
+    cores = os.cpu_count() or 1
+    return Provenance(commit(), now, platform.platform(), processor(), threads.blas(), cores, versions())
+
+
+def processor() -> str:
+    """The processor's name, and the bits of its widest vectors where it is one that has AVX."""
+    about = Path("/proc/cpuinfo").read_text(encoding="utf-8") if Path("/proc/cpuinfo").exists() else ""
+    name, flags = (re.search(rf"^{key}\s*: (.*)$", about, re.MULTILINE) for key in ("model name", "flags"))
+    known = flags[1].split() if flags else []
+    bits = next((bits for flag, bits in (("avx512f", 512), ("avx2", 256)) if flag in known), None)
+    title = name[1] if name else platform.machine()
+    return f"{title}, {bits} bits" if bits else title
 
 
 def commit(module: Path = Path(__file__)) -> str:

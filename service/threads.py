@@ -12,7 +12,7 @@ from collections.abc import Callable
 from t6gps.service import caller
 
 with caller.untouched():  # its import sets a variable
-    from threadpoolctl import threadpool_limits
+    from threadpoolctl import threadpool_info, threadpool_limits
 
 
 def limit() -> Callable[[], None]:
@@ -29,3 +29,9 @@ def limit() -> Callable[[], None]:
             torch.set_num_threads(threads_n)
 
     return restore
+
+
+def blas() -> str:
+    """The processor that NumPy's BLAS computes for, as it calls it. OPENBLAS_CORETYPE chooses, else the machine."""
+    found = (library.get("architecture") for library in threadpool_info() if library["user_api"] == "blas")
+    return next((name for name in found if name), "unknown")

@@ -37,7 +37,10 @@ class Ground(BaseModel):
 
 
 class Origin(BaseModel):
-    """What made a run: the date is UTC in ISO 8601, `compiled` has the SHA-256 of the package's compiled modules."""
+    """What made a run: the date is UTC in ISO 8601, `compiled` has the SHA-256 of the package's compiled modules.
+
+    `processor` and `blas` are those of `Provenance`; earlier versions did not write them.
+    """
 
     model_config = ConfigDict(frozen=True)
 
@@ -46,6 +49,8 @@ class Origin(BaseModel):
     date: str
     versions: dict[str, str]
     compiled: dict[str, str]
+    processor: str | None = None
+    blas: str | None = None
     ground: Ground | None = None
 
 
@@ -69,6 +74,8 @@ def _present(copy: Ground | None) -> Origin:
         date=now.date,
         versions=now.versions,
         compiled=provenance.compiled(),
+        processor=now.processor,
+        blas=now.blas,
         ground=copy,
     )
 

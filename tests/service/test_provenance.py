@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import os
 import platform
 import subprocess
+import sys
 from datetime import UTC, datetime, timedelta
 from importlib import metadata
 from pathlib import Path
@@ -20,6 +22,14 @@ def test_provenance_is_of_this_process_and_of_now() -> None:
     age = datetime.now(UTC) - datetime.fromisoformat(origin.date)
     assert timedelta(0) <= age < timedelta(minutes=1)
     assert origin.versions == versions()
+    assert origin.processor
+
+
+def test_the_processor_that_blas_computes_for_can_be_chosen() -> None:
+    say = "from t6gps.service.provenance import provenance; print(provenance().blas)"
+    chosen = {**os.environ, "OPENBLAS_CORETYPE": "Nehalem"}
+    said = subprocess.run([sys.executable, "-c", say], env=chosen, capture_output=True, text=True, check=True).stdout
+    assert said.strip() == "Nehalem"
 
 
 def test_versions_name_what_the_data_of_an_episode_depend_on() -> None:

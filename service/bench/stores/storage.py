@@ -32,8 +32,8 @@ WAYS: Mapping[str, Callable[[Run, str], pa.Table]] = {
 """Ways to ask a run, beside DuckDB in this process on the same files."""
 READS_N = 20
 """Episodes that are read from each store."""
-GROWTH_SHARE = 10
-"""An iteration of the long run is so many times smaller."""
+SMALL_SHARE = 10
+"""An iteration of many runs is so many times smaller."""
 NOTES = (
     f"episodes of preset {PRESET}, untrained policy, all columns of frames in each store, files in the page cache",
     "t6gps appends all tables of an iteration and forces them to disk; the others write frames, and force nothing",
@@ -102,8 +102,8 @@ def measure(sizes: Sizes, say: Say) -> dict[str, float | None]:
         assert isinstance(ours, T6Gps)
         figures |= _asked(ours.run, sizes.rounds, say)
         figures["windows_ratio"] = samples.windows_ratio(ours.run, say)
-    few = episodes[: max(1, sizes.episodes_n // GROWTH_SHARE)]
-    figures["append_growth"] = _growth(few, sizes.growth_n, say)
+    figures["append_growth"] = _growth(episodes, sizes.growth_n, say)
+    few = episodes[: max(1, sizes.episodes_n // SMALL_SHARE)]
     return figures | many_runs.many_runs(few, sizes.runs_n, sizes.run_iterations_n, sizes.rounds, say)
 
 
