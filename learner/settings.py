@@ -58,6 +58,12 @@ class ActionValueSettings(Settings):
     step_weight: float = Field(
         0.3, gt=0.0, le=100.0, description="w: larger ones trust Q farther from the policy (m s)"
     )
+    reach_noise: float = Field(
+        0.0,
+        ge=0.0,
+        le=10.0,
+        description="exploration while it leads, about what winches reach (reaches of a step); 0: as before",
+    )
     ascents: int = Field(4, ge=1, le=1000, description="steps of gradient ascent to u*")
     ascent_rate: float = Field(0.5, gt=0.0, le=1.0, description="share of the way that a step of ascent takes")
 
@@ -101,12 +107,16 @@ class LearnerSettings(Settings):
         3, ge=1, le=100, description="steps of that pass: the mean over all lengths up to it"
     )
 
+    def leads(self, iteration: int) -> bool:
+        """True where the action value improves the actions of an iteration."""
+        return 0 < self.value_from <= iteration
+
     @model_validator(mode="after")
     def _led_by_a_value(self) -> "LearnerSettings":
-        if (self.models_share or self.rounds > 1) and not self.value_from:
+        if (self.models_share or self.rounds > 1 or self.action_value.reach_noise) and not self.value_from:
             raise ValueError(
-                "models_share and rounds need an action value; set value_from to 1 or later, or models_share to 0 and "
-                "rounds to 1"
+                "models_share, rounds and action_value.reach_noise need an action value; set value_from to 1 or later, "
+                "or models_share and reach_noise to 0 and rounds to 1"
             )
         if self.models_share and self.reduced_state != "nodes":
             raise ValueError(

@@ -9,6 +9,7 @@ import numpy as np
 from t6gps.learner import streams
 from t6gps.service.config import Config
 from t6gps.storage.records import EpisodePlan
+from t6gps.workers.physics.engine import reach_m
 
 
 @unique
@@ -52,6 +53,7 @@ def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
             index=index,
             noise_std_m=_noise_std_m(config, iteration, index),
             version=max(iteration - staleness, 0),
+            within_reach=_within_reach(config, iteration),
         )
         for index in range(size)
     ]
@@ -64,7 +66,14 @@ def _noise_std_m(config: Config, iteration: int, index: int) -> float:
     """
     exploration = config.exploration
     quiet = int((index + 1) * exploration.quiet_share) > int(index * exploration.quiet_share)
-    return exploration.noise_std_m * (QUIET if iteration and quiet else 1.0)
+    noise_std_m = exploration.noise_std_m
+    if _within_reach(config, iteration):
+        noise_std_m = config.learner.action_value.reach_noise * reach_m(config.robot)
+    return noise_std_m * (QUIET if iteration and quiet else 1.0)
+
+
+def _within_reach(config: Config, iteration: int) -> bool:
+    return config.learner.action_value.reach_noise > 0 and config.learner.leads(iteration)
 
 
 def evaluation_plans(
@@ -88,6 +97,7 @@ def _plan(
     index: int,
     noise_std_m: float,
     version: int,
+    within_reach: bool = False,
 ) -> EpisodePlan:
     return EpisodePlan(
         episode_id=episode_id,
@@ -99,6 +109,7 @@ def _plan(
         terrain_difficulty=config.terrain.difficulty,
         noise_std_m=noise_std_m,
         policy_version=version,
+        within_reach=within_reach,
     )
 
 

@@ -29,6 +29,11 @@ REST_LENGTH_SCALE_M, NODE_SCALE_M = 0.2, 0.5
 """Their units."""
 
 
+def rest_lengths(observation: NDArray[np.float32], nominal_m: float) -> NDArray[np.float32]:
+    """Rest lengths [..., 24] (m) in observations [..., 83], which have them about the nominal one."""
+    return observation[..., REST_LENGTHS] * np.float32(REST_LENGTH_SCALE_M) + np.float32(nominal_m)
+
+
 def _schema(*fields: pa.Field) -> pa.Schema:
     return pa.schema(fields, {"t6gps_schema_version": str(SCHEMA_VERSION)})
 

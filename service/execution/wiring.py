@@ -7,7 +7,7 @@ from typing import Any
 from t6gps.learner.learner import Learner
 from t6gps.learner.port import Task
 from t6gps.service.config import Config
-from t6gps.workers.physics.engine import CONTROL_STEP_S
+from t6gps.workers.physics.engine import reach_m
 from t6gps.workers.robot.neutral import nominal_rest_length
 from t6gps.workers.robot.symmetry import CABLE_MAP, PROPER
 
@@ -24,7 +24,7 @@ def new_learner(config: Config, **options: Any) -> Learner:
         command_range_m=(robot.shortest_command_m, robot.longest_command_m),
         offset_m=nominal_rest_length(robot),
         scale_m=ACTION_SCALE_M,
-        reach_m=robot.winch_speed_m_per_s * CONTROL_STEP_S,
+        reach_m=reach_m(robot),
         world_labels=CABLE_MAP,
         mirrored=~PROPER,
     )

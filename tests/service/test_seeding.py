@@ -49,6 +49,15 @@ def test_the_terrain_seed_of_an_evaluation_changes_the_ground_alone() -> None:
     assert all(p.noise_std_m == 0 for p in a + b)
 
 
+def test_episodes_that_the_action_value_leads_explore_within_the_reach_where_it_is_told() -> None:
+    settings = ["learner.value_from=2", "robot.winch_speed_m_per_s=0.5", "exploration.noise_std_m=0.1"]
+    for reach_noise, led in ((0.0, (0.1, False)), (1.5, (1.5 * 0.05, True))):
+        config = load("flat-quick", [*settings, f"learner.action_value.reach_noise={reach_noise}"])
+        explored = [{(p.noise_std_m, p.within_reach) for p in training_plans(config, i)} for i in range(4)]
+        assert explored == [{(0.1, False)}, {(0.1, False)}, {led}, {led}]
+        assert {(p.noise_std_m, p.within_reach) for p in evaluation_plans(config, 4, 0, None, 3)} == {(0.0, False)}
+
+
 def test_quiet_episodes_are_spread_evenly_from_the_second_iteration_on() -> None:
     config = load("rough", ["run.episodes=40", "exploration.noise_std_m=0.1", "exploration.quiet_share=0.25"])
     assert {plan.noise_std_m for plan in training_plans(config, 0)} == {0.1}

@@ -7,12 +7,13 @@ from collections.abc import Callable
 import numpy as np
 from numpy.typing import NDArray
 
+from t6gps.storage import schema
 from t6gps.storage.errors import PhysicsError, UnsoundStateError
 from t6gps.storage.records import Episode, EpisodePlan, PolicySnapshot
 from t6gps.workers.episode import exploration, policy
 from t6gps.workers.episode.recording import Outcome, Record, to_episode
 from t6gps.workers.episode.running import RunningEpisode
-from t6gps.workers.physics.engine import Engine
+from t6gps.workers.physics.engine import Engine, reach_m
 from t6gps.workers.physics.observer import steer
 from t6gps.workers.settings import RolloutSettings
 
@@ -61,7 +62,9 @@ def controlled(
     episode = RunningEpisode(
         engine, settings, plan.seed, plan.terrain_seed, plan.terrain_difficulty, nominal_m, delay_steps, plan.index
     )
-    noise = exploration.noise(episode.noise_rng, plan.noise_std_m, settings.exploration.noise_correlation, plan.steps)
+    correlation = 0.0 if plan.within_reach else settings.exploration.noise_correlation
+    noise = exploration.noise(episode.noise_rng, plan.noise_std_m, correlation, plan.steps)
+    reach = reach_m(settings.robot)
     shortest_m, longest_m = settings.robot.shortest_command_m, settings.robot.longest_command_m
 
     record = Record() if record is None else record
@@ -69,6 +72,9 @@ def controlled(
     ended_by = "completed"
     for step, departure in enumerate(noise):
         wanted = control(episode, step)
+        if plan.within_reach:
+            rest_lengths = schema.rest_lengths(episode.observation, nominal_m)
+            wanted = np.clip(wanted, rest_lengths - reach, rest_lengths + reach)
         mean, command, action = steer(wanted, departure, episode.frame.element, shortest_m, longest_m)
         try:
             episode.advance(command)

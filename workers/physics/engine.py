@@ -32,6 +32,11 @@ class Unique:
         )
 
 
+def reach_m(robot: RobotSettings) -> float:
+    """The farthest that a winch changes its rest length in a control step (m)."""
+    return robot.winch_speed_m_per_s * CONTROL_STEP_S
+
+
 class Engine(Unique, ABC):
     """The robot with the settings `robot` on its ground. Several engines may live in one process.
 

@@ -114,6 +114,33 @@ def test_without_noise_the_policy_mean_is_the_action(worker: RolloutWorker) -> N
     assert frames["action"].equals(frames["action_mean"])
 
 
+@pytest.fixture(scope="module")
+def within_reach(worker: RolloutWorker) -> Episode:
+    return worker.run(replace(PLAN, noise_std_m=0.05, within_reach=True), random_policy())
+
+
+def test_noise_within_the_reach_departs_from_what_winches_reach_and_is_white(within_reach: Episode) -> None:
+    names = ("observation", "rest_lengths", "action", "action_mean")
+    observations, rest_lengths, actions, means = (schema.array(within_reach.frames, name) for name in names)
+    act, reach = policy.ready(random_policy()), 0.1 * RolloutSettings().robot.winch_speed_m_per_s
+    for observation, rest, mean in zip(observations, rest_lengths, means, strict=False):
+        reached = np.clip(act(observation), rest - reach, rest + reach)
+        assert np.allclose(np.clip(reached, 0.5, 1.5), mean, atol=1e-6)
+    noise = actions - means
+    free = (actions > 0.5) & (actions < 1.5)
+    assert noise[free].std() == pytest.approx(0.05, rel=0.1)
+    both = free[1:] & free[:-1]
+    assert abs(np.corrcoef(noise[1:][both], noise[:-1][both])[0, 1]) < 0.15  # labels change with the triangle
+
+
+def test_without_noise_the_reach_changes_the_command_and_not_the_motion(worker: RolloutWorker) -> None:
+    plan = replace(PLAN, noise_std_m=0.0, steps=5)  # later, what is rounded otherwise has grown
+    far, near = (worker.run(replace(plan, within_reach=within), random_policy()).frames for within in (False, True))
+    assert not np.allclose(schema.array(far, "action"), schema.array(near, "action"), atol=0.01)
+    for name in ("rest_lengths", "nodes"):
+        assert np.allclose(schema.array(far, name), schema.array(near, name), atol=1e-5)
+
+
 def test_canonical_columns_map_back_to_the_world(flat: Episode) -> None:
     frames = flat.frames
     rows = frames.num_rows
