@@ -113,10 +113,10 @@ class LearnerSettings(Settings):
 
     @model_validator(mode="after")
     def _led_by_a_value(self) -> "LearnerSettings":
-        if (self.models_share or self.rounds > 1 or self.action_value.reach_noise) and not self.value_from:
+        if (self.models_share or self.rounds > 1) and not self.value_from:
             raise ValueError(
-                "models_share, rounds and action_value.reach_noise need an action value; set value_from to 1 or later, "
-                "or models_share and reach_noise to 0 and rounds to 1"
+                "models_share and rounds need an action value; set value_from to 1 or later, or models_share to 0 and "
+                "rounds to 1"
             )
         if self.models_share and self.reduced_state != "nodes":
             raise ValueError(

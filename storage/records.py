@@ -37,7 +37,7 @@ class EpisodePlan:
     terrain_seed, terrain_difficulty     ground, 0 is flat and 1 the paper's roughness
     noise_std_m       standard deviation of the exploration noise per cable (m); 0 for an evaluation
     policy_version    the oldest policy that may act in this episode
-    within_reach      noise departs from what the winches reach of a command in a step, anew in each; else from all of it
+    within_reach      noise departs from what winches reach of a command in a step, anew in each; else from all of it
     """
 
     episode_id: int

@@ -298,7 +298,6 @@ def test_what_leads_with_the_value_matters(
     [
         ({"rounds": 2}, "need an action value; set value_from"),
         ({"models_share": 0.5}, "need an action value; set value_from"),
-        ({"action_value": {"reach_noise": 1.0}}, "need an action value; set value_from"),
         ({"models_share": 0.5, "value_from": 1, "reduced_state": "com"}, "models_share needs reduced_state = nodes"),
         ({"action_value": {"improved_iterations": 4}}, "is more than remembered_iterations = 3; remember as many"),
         ({"action_value": {"improved_iterations": 2}, "value_from": 1}, "would add their old ones; set it to 0"),

@@ -103,7 +103,7 @@ def test_a_resumed_run_that_follows_an_action_value_reads_what_it_needs_from_its
     assert digests(stopped.path) == digests(whole.path)
 
 
-def test_a_policy_that_stays_departs_by_nothing_from_itself_also_where_noise_is_within_the_reach(tmp_path: Path) -> None:
+def test_a_policy_that_stays_does_not_depart_from_itself_also_within_the_reach(tmp_path: Path) -> None:
     few = ("learner.action_value.first_steps=2", "learner.action_value.steps=2", "learner.learning_rate=1e-9")
     config = load("flat-quick", [*TINY, "learner.value_from=1", *few, "learner.action_value.reach_noise=1"])
     run = catalog.create(tmp_path, "still", config.to_json())
