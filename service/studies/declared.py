@@ -98,10 +98,10 @@ PAPER_NETWORK = ("learner.hidden_layers=[256, 256, 256]",)
 PAPER_OBSERVATION = ("learner.observation=sensors",)
 NO_VALUE = (
     *("learner.value_from=0", "learner.rounds=1", "learner.models_share=0"),
-    *("learner.replay_iterations=1", "learner.epochs=8", "run.iterations=5"),
+    *("learner.replay_iterations=1", "learner.epochs=8", "run.iterations=5", "exploration.noise_correlation=0.6"),
 )
-"""The backward pass throughout, replay, the default number of epochs and the paper's of iterations, where a preset has
-an action value."""
+"""The backward pass throughout, replay, epochs and noise as by default, and the paper's number of iterations, where a
+preset has an action value."""
 AS_IN_THE_PAPER = (*PAPER_COST, *PAPER_NETWORK, *PAPER_OBSERVATION, *NO_VALUE, "exploration.quiet_share=0")
 """Cost, network, observation, exploration and iterations of the paper (Sec. IV-A, IV-C), under which its claims are
 checked, and replay.
