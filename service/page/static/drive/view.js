@@ -103,7 +103,7 @@ export function open(place, episode, leave) {
     if (drawing?.message) return unread(data, drawing.message);
     const solid = drawing?.solid;
     const place = h("div", { class: "stage", tabindex: "0", role: "group", "aria-label": "Scene: click the ground for a waypoint, drag a robot to push it; arrows move the waypoint, with shift they push", onkeydown: keys },
-      h("div", { class: "legend" }, h("span", {}, "click: waypoint"), h("span", {}, "drag a robot: push"), h("span", {}, "the sign: its triangle, Δ blue or Λ orange")));
+      h("div", { class: "legend" }, h("span", {}, "click: waypoint"), h("span", {}, "drag a robot: push"), h("span", {}, "sign above a robot: its triangle, Δ blue, Λ orange")));
     fill(stages, place);
     fill(said, solid ? null : empty("This browser draws nothing in three dimensions (WebGL), so that the robot is seen from above."));
     raised = () => (solid ?? plain)(place, mine);

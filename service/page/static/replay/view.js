@@ -216,7 +216,7 @@ async function three() {
 }
 
 function legend(episode, solid) {
-  return h("div", { class: "legend" }, solid && h("span", {}, "tension 0 ", h("i"), ` ${number(episode.brightest_n)} N, thicker as tighter`), h("span", {}, "its sign: the triangle, Δ blue or Λ orange"), h("span", {}, "circle: waypoint"));
+  return h("div", { class: "legend" }, solid && h("span", {}, "tension 0 ", h("i"), ` ${number(episode.brightest_n)} N, thicker as tighter`), h("span", {}, "sign above a robot: its triangle, Δ blue, Λ orange"), h("span", {}, "circle: waypoint"));
 }
 
 function positions(episode, nodes) {
