@@ -1,6 +1,6 @@
 // The page: views by address, the token, and whether the server answers.
 
-import { onReachable } from "./base/api.js";
+import { onReachable, part } from "./base/api.js";
 import { fault, fill, h } from "./base/dom.js";
 import { here, to } from "./base/link.js";
 import { begin, leave } from "./base/session.js";
@@ -15,7 +15,7 @@ const seen = { name: null, view: null };
 
 async function show() {
   const { view, ...values } = here();
-  const name = view in VIEWS ? view : "runs";
+  const name = Object.hasOwn(VIEWS, view) ? view : "runs";
   for (const link of document.querySelectorAll("#views a"))
     link.toggleAttribute("aria-current", link.dataset.view === name);
   document.querySelectorAll("#views a[aria-current]").forEach((link) => link.setAttribute("aria-current", "page"));
@@ -24,7 +24,7 @@ async function show() {
     Object.assign(seen, { name, view: null });
     const place = h("div", { class: `view ${name}` });
     fill(content, place);
-    const { open } = await VIEWS[name][1]().catch(() => ({ open: missing }));
+    const { open } = await part(VIEWS[name][1]).catch(({ message }) => ({ open: (place) => missing(place, message) }));
     if (seen.name !== name) return; // somebody went on meanwhile
     document.title = `${VIEWS[name][0]} · T6-GPS`;
     seen.view = open(place);
@@ -33,9 +33,9 @@ async function show() {
 }
 
 /** In the place of a view whose files did not come. */
-function missing(place) {
+function missing(place, sentence) {
   seen.name = null; // so that it is tried again
-  fill(place, fault("The server does not answer, so that this part of the page could not be read. Choose it again."));
+  fill(place, fault(sentence), h("button", { type: "button", class: "main", onclick: show }, "Try again"));
   return { update() {}, close() {} };
 }
 

@@ -5,7 +5,9 @@ from __future__ import annotations
 import csv
 import io
 import json
-from collections.abc import Callable
+import shutil
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 import no_webgl
@@ -24,6 +26,15 @@ PHONE = {"viewport": {"width": 390, "height": 800}, "has_touch": True, "is_mobil
 EPISODES = (
     "#/query?runs=tiny-*&sql=SELECT+run%2C+iteration%2C+episode_id%2C+cost+FROM+episodes+ORDER+BY+run%2C+episode_id"
 )
+
+WRITTEN = """
+window.written = new Set();
+for (const context of [CanvasRenderingContext2D, OffscreenCanvasRenderingContext2D]) {
+  const write = context.prototype.fillText;
+  context.prototype.fillText = function (text, ...rest) { written.add(text); return write.call(this, text, ...rest); };
+}
+"""
+"""A script that keeps what is written on canvases."""
 
 
 def nodes_of(server: Server, run: str, episode: int, step: int) -> np.ndarray:
@@ -67,10 +78,99 @@ def test_the_list_finds_runs_and_those_alike_make_one_curve(visit: Opened, serve
     page.get_by_label("compare tiny-0").check()
     page.get_by_label("compare tiny-1").check()
     expect(page.get_by_role("heading", name="2 runs compared")).to_be_visible()
-    expect(page.get_by_role("cell", name="tiny (2 seeds)")).to_be_visible()
+    expect(page.get_by_role("cell", name="tiny (2 runs, 1 seed)")).to_be_visible()
     last = tables.read(catalog.open_run(served.root, "tiny-0"), "iterations", ["cost"])["cost"].to_pylist()[-1]
-    expect(page.get_by_role("img", name="tiny (2 seeds): ")).to_have_count(4)
+    expect(page.get_by_role("img", name="tiny (2 runs, 1 seed): ")).to_have_count(4)
     expect(page.get_by_role("cell", name=f"{last:.2f}").first).to_be_visible()
+
+
+@contextmanager
+def changed_copy(server: Server, name: str, section: str, **settings: object) -> Iterator[None]:
+    """A copy of tiny-0 that says of itself that it has other settings."""
+    path = server.root / name
+    shutil.copytree(server.root / "tiny-0", path)
+    try:
+        stored = catalog.open_run(server.root, name).config_path
+        values = json.loads(stored.read_text())
+        values[section] |= settings
+        stored.write_text(json.dumps(values))
+        yield
+    finally:
+        shutil.rmtree(path)
+
+
+def test_only_runs_that_differ_in_the_seed_alone_are_averaged(visit: Opened, served: Server) -> None:
+    other_seed = changed_copy(served, "tiny-2", "run", seed=2**53 + 1, workers=5, cpus_per_worker=0.5)
+    with other_seed, changed_copy(served, "spread", "randomisation", mass_spread=0.3):
+        page = visit("#/runs?compare=tiny-0,tiny-2,spread", Scope.READ)
+        row = page.get_by_role("table", name="Curves").get_by_role("row")
+        expect(row).to_have_count(3)
+        expect(row.filter(has_text="spread")).to_contain_text("spread0spread")
+        expect(row.filter(has_text="tiny")).to_contain_text(f"tiny (2 seeds)0, {2**53 + 1}")
+
+
+def test_a_link_keeps_the_iteration_and_the_kind_of_events(visit: Opened) -> None:
+    page = visit("#/runs?run=tiny-0&part=classes&iteration=0", Scope.READ)
+    expect(page.get_by_role("spinbutton", name="Iteration")).to_have_value("0")
+    expect(page.get_by_role("img", name="3 points").first).to_be_visible()
+    page.locator(".chart .u-over").first.click()
+    expect(page.get_by_role("heading", name="Episodes of iteration 1")).to_be_visible()
+    page.wait_for_url("**part=episodes**iteration=1**")
+    page.get_by_role("spinbutton", name="Iteration").fill("2")
+    page.get_by_role("spinbutton", name="Iteration").press("Enter")
+    page.wait_for_url("**iteration=2**")
+    page.get_by_role("tab", name="Events").click()
+    page.get_by_label("Kind").select_option("crash")
+    page.wait_for_url("**kind=crash**")
+    page.reload()
+    expect(page.get_by_label("Kind")).to_have_value("crash")
+    page.get_by_role("tab", name="Classes and modes").click()
+    expect(page.get_by_role("spinbutton", name="Iteration")).to_have_value("2")
+
+
+def test_an_address_that_says_nothing_shows_what_none_would(visit: Opened) -> None:
+    page = visit("#/toString?order=toString&state=none", Scope.READ)
+    expect(page.get_by_label("compare tiny-0")).to_be_visible()
+    for address in ("#/runs?run=tiny-0&part=toString&iteration=x", "#/replay?run=tiny-0&step=abc&rate=xyz&view=runs"):
+        page.goto(page.url.partition("#")[0] + address)
+        if "part" in address:
+            expect(page.get_by_role("tab", name="Pool")).to_have_attribute("aria-selected", "true")
+    expect(page.locator("output")).to_have_text("step 0 · 0.0 s")
+    expect(page.get_by_role("combobox", name="Speed")).to_have_value("1")
+
+
+def test_a_long_list_of_episodes_says_that_it_is_not_whole(visit: Opened) -> None:
+    page = visit("#/query", Scope.READ)
+    row = {"episode_id": 0, "cost": 1.0, "ended_by": "completed"}
+    page.route("**/v1/query", lambda route: route.fulfill(json=[row | {"episode_id": n} for n in range(501)]))
+    page.goto(page.url.partition("#")[0] + "#/runs?run=tiny-0&part=episodes")
+    expect(page.get_by_text("There are more than 500; the first 500 are here.").first).to_be_visible()
+    expect(page.get_by_role("table", name="Episodes", exact=True).get_by_role("row")).to_have_count(501)
+
+
+def test_a_chart_that_somebody_has_zoomed_stays_so_when_data_come(visit: Opened) -> None:
+    ranges = visit("").evaluate(
+        """async () => {
+          const { chart } = await import("/page/base/curves.js"), real = uPlot, made = [], seen = [];
+          const series = [{ label: "a", stroke: "curve-1" }];
+          const frame = () => new Promise(requestAnimationFrame);
+          window.uPlot = function (...all) { made.push(new real(...all)); return made.at(-1); };
+          const one = chart({ title: "", unit: "", series, data: [[0, 1], [0, 1]] });
+          document.body.prepend(one.element);
+          while (!made.length) await frame();
+          const range = async () => (await frame(), seen.push([made.at(-1).scales.x.min, made.at(-1).scales.x.max]));
+          one.show([[0, 1, 2, 3], [0, 1, 2, 3]]);
+          await range();
+          made[0].setScale("x", { min: 1, max: 2 });
+          await range();
+          one.show([[0, 1, 2, 3, 4], [0, 1, 2, 3, 4]]);
+          await range();
+          window.dispatchEvent(new Event("themechange"));
+          await range();
+          return seen;
+        }"""
+    )
+    assert ranges == [[0, 3], [1, 2], [1, 2], [1, 2]]
 
 
 def test_a_link_to_a_run_shows_its_curves_classes_and_episodes(visit: Opened) -> None:
@@ -90,12 +190,23 @@ def test_a_link_to_a_run_shows_its_curves_classes_and_episodes(visit: Opened) ->
 def test_the_robot_stands_where_the_stored_frame_has_it(visit: Opened, served: Server, script: str) -> None:
     page = visit("#/replay?run=tiny-0&episode=4&step=17", Scope.READ, script)
     expect(page.locator("output")).to_contain_text("step 17")
+    page.keyboard.press("ArrowLeft")  # nothing has the focus
+    page.wait_for_url("**step=16")
+    page.keyboard.press("ArrowRight")
     page.get_by_text("Numbers at this step").click()
+    expect(page.locator("output")).to_contain_text("step 17")
     np.testing.assert_allclose(drawn(page), nodes_of(served, "tiny-0", 4, 17), atol=1e-3)
     page.locator(".stage").press("Shift+ArrowRight")
     expect(page.locator("output")).to_contain_text("step 27")
     np.testing.assert_allclose(drawn(page), nodes_of(served, "tiny-0", 4, 27), atol=1e-3)
     expect(page.get_by_text("seen from above")).to_have_count(1 if script else 0)
+
+
+@pytest.mark.parametrize("script", ["", no_webgl.SCRIPT], ids=["webgl", "flat"])
+def test_robots_and_triangles_are_told_apart_by_letters(visit: Opened, script: str) -> None:
+    page = visit("#/replay?run=tiny-0&episode=4&run2=tiny-0&episode2=5", Scope.READ, script + WRITTEN)
+    for sign in ("/^A [ΔΛ]$/", "/^B [ΔΛ]$/"):
+        page.wait_for_function(f"() => [...written].some((text) => {sign}.test(text))")
 
 
 def test_two_episodes_on_one_ground_share_a_scene_and_a_clock_and_a_link_brings_them_back(visit: Opened) -> None:
@@ -107,7 +218,7 @@ def test_two_episodes_on_one_ground_share_a_scene_and_a_clock_and_a_link_brings_
     page.get_by_role("button", name="Step on").click()
     page.get_by_role("button", name="Play").click()
     page.get_by_role("button", name="Pause").click()
-    page.wait_for_url("**step=**")
+    page.wait_for_url("**step=1*")
     again = visit(page.url.partition("/#")[2].join(["#", ""]), Scope.READ)
     expect(again.locator(".tag div")).to_have_count(2)
     expect(again.locator("output")).to_have_text(page.locator("output").inner_text())
@@ -145,6 +256,20 @@ def test_a_query_completes_names_is_downloaded_whole_and_leads_into_the_replay(v
     page.get_by_label("replay episode 5 of tiny-1").click()
     expect(page.locator(".tag")).to_contain_text("tiny-1 episode 5")
     expect(page.locator("output")).to_contain_text("step 21")
+
+
+def test_a_plot_without_lines_for_each_is_kept_by_its_link_and_by_asking_again(visit: Opened) -> None:
+    page = visit(EPISODES, Scope.READ)
+    page.get_by_label("A line for each").select_option("nothing")
+    page.get_by_label("Marks").select_option("points")
+    with page.expect_request("**/v1/query"):
+        page.get_by_role("button", name="Ask").click()
+    page.get_by_label("SQL").fill(f"SELECT run, episode_id, cost, {2**53 + 1} AS wide FROM episodes LIMIT 3")
+    page.get_by_role("button", name="Ask").click()
+    expect(page.get_by_role("cell", name=str(2**53 + 1))).to_have_count(3)
+    page.reload()
+    expect(page.get_by_label("A line for each")).to_have_value("-")
+    expect(page.get_by_label("Marks")).to_have_value("points")
 
 
 def test_wrong_sql_is_said_in_place_and_the_last_result_stays(visit: Opened) -> None:

@@ -54,6 +54,11 @@ def at_work(run: Run, wanted: int) -> None:
 
 def test_a_wrong_token_is_refused_in_place_and_a_right_one_opens_the_page(visit: Opened, served: Server) -> None:
     page = visit("#/runs?run=tiny-0", scope=None)
+    for _ in range(3):
+        page.keyboard.press("Escape")
+    page.get_by_label("Token", exact=True).fill("t6gps_\u2026")
+    page.get_by_role("button", name="Open").click()
+    expect(page.get_by_role("dialog").get_by_role("alert")).to_contain_text("No token has the character “\u2026”")
     page.get_by_label("Token", exact=True).fill("t6gps_wrong")
     page.get_by_role("button", name="Open").click()
     expect(page.get_by_role("dialog").get_by_role("alert")).to_contain_text("not known here")
@@ -61,6 +66,12 @@ def test_a_wrong_token_is_refused_in_place_and_a_right_one_opens_the_page(visit:
     page.get_by_role("button", name="Open").click()
     expect(page.get_by_role("heading", name="tiny-0")).to_be_visible()
     expect(page.get_by_role("dialog")).to_have_count(0)
+    page.get_by_role("button", name="Token").click()
+    page.get_by_role("button", name="Cancel").click()
+    expect(page.get_by_role("dialog")).to_have_count(0)
+    page.reload()  # with the token of before
+    expect(page.get_by_role("heading", name="tiny-0")).to_be_visible()
+    expect(page.get_by_role("img", name="3 points").first).to_be_visible()
 
 
 def test_a_token_that_expires_is_asked_for_again_and_what_was_seen_stays(visit: Opened, served: Server) -> None:

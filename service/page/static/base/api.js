@@ -17,6 +17,7 @@ export class Unreachable extends Error {
 
 const KEPT = "t6gps-token";
 const PATIENCE_MS = 60_000;
+const TEXT_OR_NUMBER = /"(?:[^"\\]|\\.)*"|-?\d[\d.eE+-]*/g;
 const BUSY = new Set([429, 503]);
 let needToken = null;
 const listeners = new Set();
@@ -29,10 +30,6 @@ export function tokensFrom(ask) {
 
 export function keepToken(text) {
   sessionStorage.setItem(KEPT, text);
-}
-
-export function forgetToken() {
-  sessionStorage.removeItem(KEPT);
 }
 
 /** Be told whenever the server begins or ceases to answer. */
@@ -48,6 +45,8 @@ function tell(now) {
 
 /** Whether the server takes a token: null, or why not. */
 export async function tried(text) {
+  const strange = /[^!-~]/u.exec(text)?.[0];
+  if (strange) return `No token has the character “${strange}”. Copy the token again, whole and alone.`;
   try {
     const answer = await fetch("/v1/jobs", { headers: { Authorization: `Bearer ${text}` }, cache: "no-store" });
     return answer.status === 401 || answer.status === 429 ? (await answer.json()).error : null;
@@ -133,7 +132,22 @@ export function query(runs, sql, { form = "json", parameters = {}, signal } = {}
 
 /** The rows of such a result. */
 export async function rows(runs, sql, parameters = {}, signal) {
-  return (await query(runs, sql, { parameters, signal })).json();
+  return exactly(await (await query(runs, sql, { parameters, signal })).text());
+}
+
+/** The values of a JSON text, where integers that a number cannot hold are texts of their digits. */
+export function exactly(text) {
+  return JSON.parse(text.replace(TEXT_OR_NUMBER, (found) => (/^-?\d{16,}$/.test(found) && !Number.isSafeInteger(Number(found)) ? `"${found}"` : found)));
+}
+
+/** A part of the page, which is read when it is needed: `reading` imports it. */
+export async function part(reading) {
+  try {
+    return await reading();
+  } catch (error) {
+    if (error instanceof TypeError) throw new Error("The server does not answer, so that this part of the page could not be read. Try it again when the server is back.");
+    throw error;
+  }
 }
 
 /** Do something again and again while the tab is seen, until the signal ends it. */

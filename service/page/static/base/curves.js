@@ -27,10 +27,22 @@ export function chart({ title, unit, axis = "iteration", series, data, chosen = 
   const draw = () => {
     const width = Math.floor(place.clientWidth);
     if (!width) return;
+    const zoom = zoomed();
     shown.plot?.destroy();
     shown.plot = new uPlot(options(width, height, axis, shown.series, chosen), shown.data, place);
+    if (zoom) shown.plot.setScale("x", zoom);
     place.querySelector("canvas").setAttribute("role", "img");
     describe();
+  };
+  /** The part of the axis that somebody chose to see, null where all of it is seen. */
+  const zoomed = () => {
+    const { min, max } = shown.plot?.scales.x ?? {}, xs = shown.plot?.data[0] ?? [];
+    return xs.length > 1 && (min > xs[0] || max < xs.at(-1)) ? { min, max } : null;
+  };
+  const replace = (next) => {
+    const zoom = zoomed();
+    shown.plot.setData(next, !zoom);
+    if (zoom) shown.plot.setScale("x", zoom);
   };
   const describe = () => place.querySelector("canvas")?.setAttribute("aria-label", inWords(title, unit, shown.series, shown.data));
   const observer = new ResizeObserver(() => {
@@ -45,7 +57,7 @@ export function chart({ title, unit, axis = "iteration", series, data, chosen = 
     show(next, nextSeries = shown.series) {
       const same = nextSeries.length === shown.series.length && nextSeries.every((one, k) => one.label === shown.series[k].label);
       Object.assign(shown, { data: next, series: nextSeries });
-      if (shown.plot && same) shown.plot.setData(next), describe();
+      if (shown.plot && same) replace(next), describe();
       else draw();
     },
     close() {

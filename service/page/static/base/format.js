@@ -32,7 +32,7 @@ export function clock(text) {
 }
 
 const EDGES = [["back", "left", "right"], ["virtual", "left", "right"]];
-export const KINDS = ["Delta", "Lambda"];
+export const KINDS = ["Delta", "Lambda"], TRIANGLES = ["Δ", "Λ"];
 
 /** The class of a segment: kind, entry edge and exit edge. */
 export function className(row) {

@@ -3,7 +3,7 @@
 /** The view of the address, and its values. */
 export function here() {
   const [view, query] = location.hash.replace(/^#\/?/, "").split("?");
-  return { view: view || "runs", ...Object.fromEntries(new URLSearchParams(query ?? "")) };
+  return { ...Object.fromEntries(new URLSearchParams(query ?? "")), view: view || "runs" };
 }
 
 /** The address of a view with values; those that say nothing are left out. */

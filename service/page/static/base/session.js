@@ -1,6 +1,6 @@
 // The token: typed once, kept for this tab alone, asked for again when it is refused.
 
-import { forgetToken, keepToken, tokensFrom, tried } from "./api.js";
+import { keepToken, tokensFrom, tried } from "./api.js";
 import { field, fill, h } from "./dom.js";
 
 let asking = null;
@@ -10,14 +10,14 @@ export function begin() {
   tokensFrom((reason) => (asking ??= asked(reason).finally(() => (asking = null))));
 }
 
-/** Forget the token, and ask for another one. */
+/** Ask for another token, and begin anew with it. Until there is one, the old one holds. */
 export function leave() {
-  forgetToken();
-  asking ??= asked("").finally(() => (asking = null));
-  asking.then(() => location.reload());
+  asking ??= asked("", true).finally(() => (asking = null));
+  asking.then((another) => another && location.reload());
 }
 
-function asked(reason) {
+/** Whether there is another token; only who may `cancel` goes on without. */
+function asked(reason, cancel = false) {
   return new Promise((done) => {
     const input = h("input", { type: "password", name: "token", required: true, autocomplete: "off", spellcheck: "false" });
     const said = h("p", { class: "fault", role: "alert" }, reason);
@@ -25,25 +25,32 @@ function asked(reason) {
     const form = h("form", { method: "dialog" },
       h("h2", { id: "token-title" }, "A token, please"),
       h("p", {}, "Whoever runs this server makes one with ", h("code", {}, "t6gps token create"), ". It stays in this tab."),
-      field("Token", input), said, h("div", { class: "actions" }, send));
+      field("Token", input), said, h("div", { class: "actions" }, cancel && h("button", { type: "button", onclick: () => end(false) }, "Cancel"), send));
     const dialog = h("dialog", { "aria-labelledby": "token-title" }, form);
     said.hidden = !reason;
-    dialog.addEventListener("cancel", (event) => event.preventDefault());
+    let over = false;
+    dialog.addEventListener("cancel", (event) => cancel || event.preventDefault());
+    dialog.addEventListener("close", () => over || (cancel ? end(false) : dialog.showModal())); // a second Escape closes it all the same
     form.addEventListener("submit", async (event) => {
       event.preventDefault();
       send.disabled = true;
-      const refused = await tried(input.value.trim());
+      const token = input.value.trim(), refused = await tried(token);
       send.disabled = false;
       if (refused) {
         said.hidden = false;
         fill(said, refused);
         return;
       }
-      keepToken(input.value.trim());
+      keepToken(token);
+      end(true);
+    });
+    function end(another) {
+      over = true;
       dialog.close();
       dialog.remove();
-      done();
-    });
+      done(another);
+    }
+
     document.body.append(dialog);
     dialog.showModal();
   });

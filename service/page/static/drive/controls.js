@@ -23,9 +23,9 @@ export function controls(ask, push, { look, follow, end }) {
       h("div", { class: "row", role: "group", "aria-label": "Push" }, field("Push (N s)", strength), DIRECTIONS.map(([sign, words, direction]) => h("button", { type: "button", "aria-label": `push ${words}`, onclick: () => strength.reportValidity() && push(direction, Number(strength.value)) }, sign)))));
 
   function slider(title, min, max, changed, hint) {
-    const value = h("output"), tell = () => fill(value, Number(input.value).toFixed(2));
-    const input = h("input", { type: "range", min, max, step: 0.05, "aria-label": title, oninput: tell, onchange: () => changed(Number(input.value)) });
-    return { element: h("label", { class: "field", title: hint }, h("span", {}, title, " ", value), input), show: (now) => ((input.value = now), tell()) };
+    const value = h("output"), tell = (now) => fill(value, String(Number(now.toFixed(4))));
+    const input = h("input", { type: "range", min, max, step: 0.01, "aria-label": title, oninput: () => tell(Number(input.value)), onchange: () => changed(Number(input.value)) });
+    return { element: h("label", { class: "field", title: hint }, h("span", {}, title, " ", value), input), show: (now) => ((input.value = now), tell(now)) };
   }
 
   function place() {

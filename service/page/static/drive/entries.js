@@ -2,8 +2,8 @@
 
 import { get, run as path } from "../base/api.js";
 import { field, fill, h, select } from "../base/dom.js";
-import { number } from "../base/format.js";
-import { SHADES } from "./live.js";
+import { KINDS, TRIANGLES, number } from "../base/format.js";
+import { LETTERS, SHADES } from "./live.js";
 
 export const MOST_N = 4;
 
@@ -34,7 +34,7 @@ export function entrants(changed, failed, names) {
   const adding = h("form", { class: "row", onsubmit: add }, field("Run", name), h("button", {}, "Race with its newest policy"));
   const element = h("section", { class: "entrants" },
     h("div", { class: "scroll", tabindex: "0", role: "region", "aria-label": "Robots" }, h("table", {}, h("caption", { class: "hidden" }, "Robots"),
-      h("thead", {}, h("tr", {}, ["Robot", "Policy", "Place (m)", "Speed over 3 s", "To the waypoint", ""].map((title) => h("th", { scope: "col" }, title)))), body)), adding);
+      h("thead", {}, h("tr", {}, ["Robot", "Policy", "Place (m)", "Speed over 3 s", "To the waypoint", "Triangle", ""].map((title) => h("th", { scope: "col" }, title)))), body)), adding);
   let entries = [];
 
   async function add(event) {
@@ -49,14 +49,14 @@ export function entrants(changed, failed, names) {
   }
 
   function row({ run, version }, k) {
-    const choice = select([version], { value: version, "aria-label": `version of robot ${"ABCD"[k]}`, onchange: () => changed(entries.with(k, { run, version: Number(choice.value) })) });
+    const choice = select([version], { value: version, "aria-label": `version of robot ${LETTERS[k]}`, onchange: () => changed(entries.with(k, { run, version: Number(choice.value) })) });
     versions(run).then((kept) => {
       fill(choice, kept.map((one) => h("option", { value: String(one) }, one)));
       choice.value = String(version);
     }).catch((error) => failed(error.message));
-    const [place, speed, way] = (told[k] = [h("td"), h("td"), h("td")]);
-    const leave = k > 0 && h("button", { type: "button", "aria-label": `leave robot ${"ABCD"[k]} out`, onclick: () => changed(entries.toSpliced(k, 1)) }, "✕");
-    return h("tr", {}, h("th", { scope: "row" }, h("i", { class: `robot-${SHADES[k]}` }), ` ${"ABCD"[k]}`), h("td", {}, `${run} version `, choice), place, speed, way, h("td", {}, leave));
+    const [place, speed, way, triangle] = (told[k] = [h("td"), h("td"), h("td"), h("td")]);
+    const leave = k > 0 && h("button", { type: "button", "aria-label": `leave robot ${LETTERS[k]} out`, onclick: () => changed(entries.toSpliced(k, 1)) }, "✕");
+    return h("tr", {}, h("th", { scope: "row" }, h("i", { class: `robot-${SHADES[k]}` }), ` ${LETTERS[k]}`), h("td", {}, `${run} version `, choice), place, speed, way, triangle, h("td", {}, leave));
   }
 
   return {
@@ -70,8 +70,9 @@ export function entrants(changed, failed, names) {
     tell(robots) {
       robots.forEach(({ now }, k) => {
         if (!told[k] || !now) return;
-        const [place, speed, way] = told[k];
+        const [place, speed, way, triangle] = told[k];
         fill(place, now.com_m.slice(0, 2).map((value) => value.toFixed(2).replace("-", "−")).join(", "));
+        fill(triangle, `${TRIANGLES[now.kind]} ${KINDS[now.kind]}`);
         fill(speed, `${number(now.speed_m_per_s)} m/s`);
         fill(way, now.ended_by ? `⚠ ended: ${now.ended_by}` : now.reached_after_s === null ? `${now.distance_m.toFixed(1)} m` : `✓ reached after ${now.reached_after_s.toFixed(1)} s`);
       });

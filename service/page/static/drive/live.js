@@ -1,7 +1,7 @@
 // Robots of a drive as they come: the newest rows of each, in the form of an episode.
 
 const KEPT_N = 12, TRAIL_N = 300, EVEN_N = 8, BEHIND_S = 0.15;
-export const SHADES = ["bar-a", "bar-b", "curve-2", "curve-4"];
+export const LETTERS = "ABCD", SHADES = ["bar-a", "bar-b", "curve-2", "curve-4"];
 
 /** Robots of a scene, without a row yet. */
 export function robots(scene) {

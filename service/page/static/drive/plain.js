@@ -1,9 +1,9 @@
 // A drive from above, for browsers that draw nothing in three dimensions: the same as `solid`.
 
 import { colour } from "../base/curves.js";
-import { body, circle, hills, line } from "../replay/flat.js";
+import { above, body, circle, hills, line, words } from "../replay/flat.js";
 import { NODES_N, moment, nodesAt, pointAt } from "../replay/motion.js";
-import { SHADES, evened } from "./live.js";
+import { LETTERS, SHADES, evened } from "./live.js";
 
 const VIEW_M = 9, GRAB_M = 1.1, ARROW_M_PER_N_S = 0.015;
 
@@ -45,6 +45,7 @@ export function plain(place, robots) {
       circle(pen, one.mark, one.waypoint_radius_m, colour(k ? SHADES[k] : "cap"), x, y, size);
       body(pen, one, nodes[k], moment(one, time_s).row, colour(SHADES[k]), x, y, size);
     });
+    robots.forEach((one, k) => above(pen, words(one, moment(one, time_s).row, robots.length > 1 && LETTERS[k]), nodes[k], colour(SHADES[k]), x, y));
     if (pulled) {
       const [px, py] = points[pulled.k], tip = [0, 1].map((axis) => [px, py][axis] + ARROW_M_PER_N_S * pulled.impulse[axis]);
       line(pen, [[x(px), y(py)], [x(tip[0]), y(tip[1])]], colour("bad"), 5);

@@ -6,7 +6,7 @@ import { heightOf, moment } from "../replay/motion.js";
 import { robot } from "../replay/robot.js";
 import { band, dispose, ground, waypoint } from "../replay/surroundings.js";
 import { theatre } from "../replay/theatre.js";
-import { SHADES, evened } from "./live.js";
+import { LETTERS, SHADES, evened } from "./live.js";
 
 const PLANE_M = 24, TRAIL_M = 0.05, SOFT = 0.04, NEAR_PX = 22, INSIDE = 0.8, ARROW_M_PER_N_S = 0.015;
 
@@ -22,7 +22,7 @@ export function solid(place, robots) {
     floor = ground({ ground: robots[0].ground, com_m: [-PLANE_M, -PLANE_M, 0, PLANE_M, PLANE_M, 0], waypoints: [] });
     stage.world.add(floor);
     parts = robots.map((one, k) => {
-      const body = robot(one, colour(SHADES[k])), mark = waypoint(one, colour(k ? SHADES[k] : "cap")), way = new THREE.Group(), groups = [body.group, mark.group, way];
+      const body = robot(one, colour(SHADES[k]), robots.length > 1 && LETTERS[k]), mark = waypoint(one, colour(k ? SHADES[k] : "cap")), way = new THREE.Group(), groups = [body.group, mark.group, way];
       stage.world.add(...groups);
       return { one, body, mark, way, groups, trail_n: 0 };
     });

@@ -1,6 +1,6 @@
 // Somebody drives the policy of an episode: the server simulates, frames come as a stream, commands go back.
 
-import { Refusal, answered, post } from "../base/api.js";
+import { Refusal, answered, part, post } from "../base/api.js";
 import { empty, fault, fill, h } from "../base/dom.js";
 import { follow } from "../base/follow.js";
 import { note } from "../base/link.js";
@@ -12,6 +12,7 @@ import { pointing } from "./pointing.js";
 
 const TOLD_MS = 250, STEP_M = 0.5;
 const KEYS = { ArrowUp: [0, 1], ArrowDown: [0, -1], ArrowLeft: [-1, 0], ArrowRight: [1, 0] };
+const OWN = "t6gps-drive"; // the drive that this tab has begun, also before it was read again
 const rounded = (value) => Math.round(100 * value) / 100;
 const me = crypto.randomUUID().slice(0, 8);
 
@@ -25,7 +26,7 @@ export function open(place, episode, leave) {
     h("li", {}, "A click on the ground sets the waypoint. A drag from a robot pushes it. A drag elsewhere turns the view."),
     h("li", {}, "With the scene in focus, arrows move the waypoint by half a metre, as one sees it. Shift and an arrow push robot A."),
     h("li", {}, "Space pauses, and Home starts again.")));
-  let wanted = {}, drive = null, own = null, watching = null, found = [], ground = null, raised = null, stage = null, pace = null, frame_n = 0, begun_n = 0, told_ms = 0, drawn_s = null;
+  let wanted = {}, drive = null, watching = null, found = [], ground = null, raised = null, stage = null, pace = null, frame_n = 0, begun_n = 0, told_ms = 0, drawn_s = null;
   fill(place, h("p", { class: "count" }, `Seed and ground of episode ${episode.episode} of ${episode.run}. `, h("button", { type: "button", class: "quiet", onclick: leave }, "Back to the replay")), said, stages, panel.element, racers.element, help);
   frame_n = requestAnimationFrame(tick);
 
@@ -35,15 +36,16 @@ export function open(place, episode, leave) {
     drive = null;
     fill(said, empty("Starting the simulator …"));
     try {
-      if (before && before === own) await ended(before);
+      if (before && before === sessionStorage.getItem(OWN)) await ended(before);
       const entries = values.policies ? read(values.policies) : [{ run: episode.run, version: await acting(episode, left.signal) }];
       if (overtaken()) return;
       wanted = { ...values, policies: written(entries) };
       racers.show(entries);
-      const other = (value) => (value === undefined ? null : Number(value));
+      const other = (value) => (value === undefined ? null : Number.isFinite(Number(value)) ? Number(value) : value); // the server says what is wrong with it
       const { id } = await post("/v1/drives", { entries, episode: episode.episode, evaluation: episode.evaluation, friction: other(values.friction), terrain_difficulty: other(values.terrain) });
       if (overtaken()) return void (await ended(id));
-      drive = own = id;
+      drive = id;
+      sessionStorage.setItem(OWN, id);
       noted({ drive: id });
       look(values.waypoint);
     } catch (error) {
@@ -87,22 +89,31 @@ export function open(place, episode, leave) {
   }
 
   async function scene(data) {
-    panel.scene(data);
-    if (ground?.terrain_difficulty === data.terrain_difficulty) return; // what was changed is not to be seen
+    const before = ground;
     ground = data;
+    panel.scene(data);
+    if (before?.terrain_difficulty === data.terrain_difficulty) return; // what was changed is not to be seen
     stage?.close();
     stage = raised = null;
     found = robots(data);
     pace = pacer();
     racers.show(data.robots.map(({ run, version }) => ({ run, version })));
-    const mine = found, solid = await three();
+    const mine = found, drawing = await three().catch(({ message }) => ({ message }));
     if (mine !== found || left.signal.aborted) return;
+    if (drawing?.message) return unread(data, drawing.message);
+    const solid = drawing?.solid;
     const place = h("div", { class: "stage", tabindex: "0", role: "group", "aria-label": "Scene: click the ground for a waypoint, drag a robot to push it; arrows move the waypoint, with shift they push", onkeydown: keys },
-      h("div", { class: "legend" }, h("span", {}, "click: waypoint"), h("span", {}, "drag a robot: push"), h("span", {}, "on a triangle: Δ blue, Λ orange")));
+      h("div", { class: "legend" }, h("span", {}, "click: waypoint"), h("span", {}, "drag a robot: push"), h("span", {}, "sign above a robot: its triangle, Δ blue, Λ orange")));
     fill(stages, place);
     fill(said, solid ? null : empty("This browser draws nothing in three dimensions (WebGL), so that the robot is seen from above."));
     raised = () => (solid ?? plain)(place, mine);
     if (mine.every((one) => one.now)) raise(); // its first frame has come meanwhile, and a pause brings no other
+  }
+
+  /** The drawing could not be had; a scene that comes later tries it again, too. */
+  function unread(data, sentence) {
+    ground = null;
+    fill(said, fault(sentence), h("button", { type: "button", class: "main", onclick: () => scene(data) }, "Try again"), " ", h("button", { type: "button", onclick: leave }, "Back to the replay"));
   }
 
   function frame(data) {
@@ -148,6 +159,7 @@ export function open(place, episode, leave) {
       await answered(`/v1/drives/${drive}`, { method: "POST", body: { by: me, ...command } });
     } catch (error) {
       fill(said, fault(error.message));
+      if (ground) panel.scene(ground); // what was refused does not hold
     }
   }
 
@@ -210,5 +222,5 @@ export function open(place, episode, leave) {
 /** The drawing in three dimensions, null where the browser cannot. */
 async function three() {
   if (document.createElement("canvas").getContext("webgl2") === null) return null;
-  return (await import("./solid.js")).solid;
+  return part(() => import("./solid.js"));
 }

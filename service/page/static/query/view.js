@@ -1,6 +1,6 @@
 // One SELECT over runs: completion of names, the rows, a plot of them, and the whole result as a file.
 
-import { query, rows } from "../base/api.js";
+import { exactly, query, rows } from "../base/api.js";
 import { empty, fault, field, fill, h, table } from "../base/dom.js";
 import { number } from "../base/format.js";
 import { here, to } from "../base/link.js";
@@ -37,8 +37,9 @@ export function open(place) {
 
   function choose() {
     list.close();
-    const { x, y } = here();
-    const next = to("query", { runs: runs.value, sql: sql.value, x, y });
+    const { x, y, by, marks } = here();
+    const next = to("query", { runs: runs.value, sql: sql.value, x, y, by, marks });
+    asked = "";
     if (location.hash === next) answer();
     else location.hash = next;
   }
@@ -55,7 +56,7 @@ export function open(place) {
     try {
       const found = await query(runs.value.trim(), `SELECT * FROM (\n${bare()}\n) LIMIT ${ROWS_N + 1}`, { signal: left.signal });
       const warnings = JSON.parse(found.headers.get(WARNINGS) ?? "[]");
-      const lines = await found.json();
+      const lines = exactly(await found.text());
       if (number_ === latest) show(lines, warnings);
     } catch (error) {
       if (!left.signal.aborted && number_ === latest) fill(said, fault(error.message)); // the last result stays below

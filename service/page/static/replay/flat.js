@@ -1,9 +1,10 @@
 // Episodes from above, for browsers that draw nothing in three dimensions.
 
 import { colour } from "../base/curves.js";
-import { NODES_N, heightOf, moment, nodesAt, pointAt, smoothed, waypointAt } from "./motion.js";
+import { TRIANGLES } from "../base/format.js";
+import { NODES_N, heightOf, moment, nodesAt, pointAt, segmentAt, smoothed, waypointAt } from "./motion.js";
 
-const VIEW_M = 8;
+const VIEW_M = 8, SIGN_PX = 20, ABOVE_M = 0.3;
 
 /** The same as `scene`, on a plain canvas. */
 export function flat(place, episodes, letters) {
@@ -37,7 +38,9 @@ export function flat(place, episodes, letters) {
     pen.fillStyle = colour("plane");
     pen.fillRect(0, 0, width, height);
     hills(pen, episodes[0], x, y, scale);
-    episodes.forEach((episode, k) => draw(pen, episode, nodes[k], moment(episode, time_s).row, colour(letters[k] === "B" ? "bar-b" : "bar-a"), x, y, scale));
+    const rows = episodes.map((episode) => moment(episode, time_s).row), shades = letters.map((letter) => colour(letter === "B" ? "bar-b" : "bar-a"));
+    episodes.forEach((episode, k) => draw(pen, episode, nodes[k], rows[k], shades[k], x, y, scale));
+    episodes.forEach((episode, k) => above(pen, words(episode, rows[k], episodes.length > 1 && letters[k]), nodes[k], shades[k], x, y));
   }
 
   show(0);
@@ -97,10 +100,32 @@ export function circle(pen, mark, radius_m, style, x, y, scale) {
 /** A robot in a row: its triangle, cables and bars. */
 export function body(pen, episode, nodes, row, shade, x, y, scale) {
   const node = (k) => [x(nodes[3 * k]), y(nodes[3 * k + 1])];
-  pen.fillStyle = colour(["delta", "lambda"][episode.segments.find((span) => row < span.stop).kind]);
+  pen.fillStyle = colour(["delta", "lambda"][segmentAt(episode, row).kind]);
   pen.beginPath();
   episode.faces[episode.face[row]].forEach((k, n) => pen[n ? "lineTo" : "moveTo"](...node(k)));
   pen.fill();
   for (const [a, b] of episode.cables) line(pen, [node(a), node(b)], colour("faint-text"), 1);
   for (const [a, b] of episode.bars) line(pen, [node(a), node(b)], shade, Math.max(2, 2 * episode.bar_radius_m * scale));
+}
+
+/** What tells a robot and its triangle apart without colours: its letter, where it has one, and Δ or Λ. */
+export const words = (episode, row, letter) => [letter, TRIANGLES[segmentAt(episode, row).kind]].filter(Boolean).join(" ");
+
+/** A sign above a robot. */
+export function above(pen, text, nodes, shade, x, y) {
+  const middle = nodes.reduce((sum, value, k) => sum + (k % 3 === 0 ? value / NODES_N : 0), 0), top = nodes.reduce((most, value, k) => (k % 3 === 1 ? Math.max(most, value) : most), -Infinity);
+  sign(pen, text, x(middle), y(top + ABOVE_M), SIGN_PX * devicePixelRatio, shade);
+}
+
+/** A text in a frame of a colour around a point of the canvas, so high. */
+export function sign(pen, text, x, y, height, shade) {
+  pen.font = `600 ${0.7 * height}px system-ui`;
+  const width = pen.measureText(text).width + 0.7 * height;
+  Object.assign(pen, { fillStyle: colour("card"), strokeStyle: shade, lineWidth: height / 10, textAlign: "center", textBaseline: "middle" });
+  pen.beginPath();
+  pen.roundRect(x - width / 2, y - height / 2, width, height, height / 4);
+  pen.fill();
+  pen.stroke();
+  pen.fillStyle = colour("text");
+  pen.fillText(text, x, y);
 }

@@ -1,13 +1,15 @@
-// A robot in a scene: bars, their ends, cables by tension, and the triangle that it stands on.
+// A robot in a scene: bars, their ends, cables by tension, the triangle that it stands on, and its sign.
 
 import * as THREE from "../vendor/three/three.module.min.js";
 import { colour } from "../base/curves.js";
-import { NODES_N, nodesAt, turbo } from "./motion.js";
+import { words } from "./flat.js";
+import { label } from "./label.js";
+import { NODES_N, nodesAt, segmentAt, turbo } from "./motion.js";
 
-const BALL_PER_BAR = 1.25, SLACK_M = 0.004, TIGHT_M = 0.016, CABLES_N = 24;
+const BALL_PER_BAR = 1.25, SLACK_M = 0.004, TIGHT_M = 0.016, CABLES_N = 24, ABOVE_M = 1.15;
 
-/** The robot of an episode. `show(moment)` moves it; `nodes()` says where the balls at its nodes are drawn. */
-export function robot(episode, barColour) {
+/** The robot of an episode; where there are several, each has a letter. `show(moment)` moves it; `nodes()` says where the balls at its nodes are drawn. */
+export function robot(episode, barColour, letter) {
   const group = new THREE.Group();
   const rod = new THREE.CylinderGeometry(1, 1, 1, 14).rotateX(Math.PI / 2);
   const solid = (shade) => new THREE.MeshLambertMaterial({ color: shade });
@@ -18,9 +20,10 @@ export function robot(episode, barColour) {
   corners.setAttribute("position", new THREE.Float32BufferAttribute(new Float32Array(9), 3));
   const triangle = new THREE.Mesh(corners, new THREE.MeshBasicMaterial({ transparent: true, opacity: 0.7, side: THREE.DoubleSide, polygonOffset: true, polygonOffsetFactor: -2, polygonOffsetUnits: -2 }));
   const com = new THREE.Mesh(new THREE.SphereGeometry(0.05, 16, 12), solid(colour("cap")));
+  const above = label(barColour);
   for (const part of [bars, cables, balls, triangle]) part.frustumCulled = false;
   bars.castShadow = balls.castShadow = cables.castShadow = true;
-  group.add(bars, cables, balls, triangle, com);
+  group.add(bars, cables, balls, triangle, above.sprite, com);
   const kinds = ["delta", "lambda"].map((name) => new THREE.Color(colour(name)));
   const nodes = new Float64Array(3 * NODES_N), ends = new Float64Array(3 * NODES_N), a = new THREE.Vector3(), b = new THREE.Vector3();
   const middle = new THREE.Vector3(), turn = new THREE.Quaternion(), size = new THREE.Vector3(), matrix = new THREE.Matrix4();
@@ -58,10 +61,11 @@ export function robot(episode, barColour) {
     const face = episode.faces[episode.face[moment.row]], position = corners.attributes.position;
     face.forEach((node, k) => position.setXYZ(k, nodes[3 * node], nodes[3 * node + 1], nodes[3 * node + 2]));
     position.needsUpdate = true;
-    const segment = episode.segments.find((span) => moment.row < span.stop);
-    triangle.material.color.copy(kinds[segment.kind]);
+    triangle.material.color.copy(kinds[segmentAt(episode, moment.row).kind]);
     const at = (axis) => episode.com_m[3 * moment.row + axis] + moment.share * (episode.com_m[3 * moment.next + axis] - episode.com_m[3 * moment.row + axis]);
     com.position.set(at(0), at(1), at(2));
+    above.sprite.position.set(at(0), at(1), at(2) + ABOVE_M);
+    above.show(words(episode, moment.row, letter));
   }
 
   return { group, show, nodes: () => Array.from({ length: NODES_N }, (_, k) => {

@@ -16,7 +16,7 @@ export function scene(place, episodes, letters) {
     parts.forEach((part) => part.groups.forEach((group) => (dispose(group), stage.world.remove(group))));
     parts = episodes.map((episode, k) => {
       const shade = colour(letters[k] === "B" ? "bar-b" : "cap");
-      const body = robot(episode, colour(letters[k] === "B" ? "bar-b" : "bar-a")), way = track(episode, shade), mark = waypoint(episode, shade), below = ground(episode);
+      const body = robot(episode, colour(letters[k] === "B" ? "bar-b" : "bar-a"), episodes.length > 1 && letters[k]), way = track(episode, shade), mark = waypoint(episode, shade), below = ground(episode);
       const groups = [body.group, way.group, mark.group, below];
       stage.world.add(...groups);
       return { episode, body, way, mark, groups };

@@ -118,6 +118,7 @@ function flat(shade, opacity) {
 export function dispose(group) {
   group.traverse((part) => {
     part.geometry?.dispose();
+    part.material?.map?.dispose();
     part.material?.dispose();
   });
   group.clear();

@@ -2,6 +2,7 @@
 
 import { colour } from "../base/curves.js";
 import { h } from "../base/dom.js";
+import { TRIANGLES } from "../base/format.js";
 
 const HEIGHT = 44, BAND = 16, STUCK = 5;
 
@@ -53,7 +54,7 @@ export function timeline(episode, letter, length_s, scrub) {
       pen.fillRect(left, low, Math.max(1, right - left - ratio), band - (low - top));
       if (right - left > 16 * ratio) {
         pen.fillStyle = colour("on-accent");
-        pen.fillText(span.kind ? "Λ" : "Δ", left + 4 * ratio, top + band / 2 + 2 * ratio);
+        pen.fillText(TRIANGLES[span.kind], left + 4 * ratio, top + band / 2 + 2 * ratio);
       }
     }
     pen.fillStyle = colour("bad");

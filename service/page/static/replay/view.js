@@ -1,6 +1,6 @@
 // The replay of an episode, and of a second one beside it.
 
-import { get, repeatedly, run as path } from "../base/api.js";
+import { Refusal, get, part, repeatedly, run as path } from "../base/api.js";
 import { empty, fault, fill, h, select, table } from "../base/dom.js";
 import { number } from "../base/format.js";
 import { here, note, to } from "../base/link.js";
@@ -10,7 +10,7 @@ import { isStuck, moment, segmentAt } from "./motion.js";
 import { picker } from "./pickers.js";
 import { timeline } from "./timeline.js";
 
-const NEWEST_MS = 3000;
+const NEWEST_MS = 3000, REST_MS = 200;
 const NO_DRIVE = { drive: "", policies: "", friction: "", terrain: "", waypoint: "" };
 const RATES = ["0.25", "0.5", "1", "2", "4", "8"];
 
@@ -31,19 +31,20 @@ export function open(place) {
   const details = h("details", { ontoggle: () => (told = -1) }, h("summary", {}, "Numbers at this step"), numbers);
   const transport = h("div", { class: "transport", role: "group", "aria-label": "Replay" }, play, button("Step back", -1), button("Step on", 1), h("label", {}, "Speed", rate), h("label", {}, follow, "Follow"),
     h("button", { type: "button", onclick: () => views.forEach((one) => one.view.look()) }, "Reset view"), output);
-  let wanted = {}, drive = null, loaded = [], views = [], rows = [], told = -1, asked = 0;
+  let wanted = {}, drive = null, loaded = [], views = [], rows = [], told = -1, asked = 0, rests = 0;
   const time = clock(shown, (playing) => {
     fill(play, playing ? "❚❚ Pause" : "▶ Play");
+    clearTimeout(rests);
     if (playing || !loaded.length) return;
-    const step = Math.floor(time.state.time_s / step_s() + 1e-6); // what stands is a stored row
-    time.set(step * step_s());
-    note({ step: step || "" });
+    time.set(step() * step_s()); // what stands is a stored row
+    rests = setTimeout(() => note({ step: step() || "" }), REST_MS); // where somebody has come to rest
   });
+  const step = () => Math.floor(time.state.time_s / step_s() + 1e-6);
   const step_s = () => (loaded[0]?.time_s.length > 1 ? loaded[0].time_s[1] : 0.1);
   time.play(false);
   fill(place, h("h1", { class: "hidden" }, "Replay"), names, h("div", { class: "pickers" }, first.element, second.element, beside, newest, wheel), said, stages, lines, scrub, transport, details, cockpit);
   wheel.hidden = true; // before there is an episode
-  place.addEventListener("keydown", keys);
+  document.addEventListener("keydown", keys);
   get("/v1/runs", left.signal).then((runs) => fill(names, runs.map((run) => h("option", { value: run.name })))).catch(() => {}); // names are a convenience; the fields take any
 
   function button(title, by) {
@@ -56,10 +57,11 @@ export function open(place) {
   }
 
   function keys(event) {
-    if (drive || event.target.matches("input:not([type=range], [type=checkbox]), select, textarea")) return;
+    if (drive || !loaded.length || event.defaultPrevented || event.ctrlKey || event.altKey || event.metaKey) return;
+    if (event.target.closest("input:not([type=range], [type=checkbox]), select, textarea, .scroll") || document.querySelector("dialog[open]")) return;
     const by = { ArrowLeft: -1, ArrowRight: 1, Home: -1e9, End: 1e9 }[event.key];
     if (by) by_steps(by * (event.shiftKey ? 10 : 1));
-    else if (event.key === " " && !event.target.matches("button, summary, input")) time.play(!time.state.playing);
+    else if (event.key === " " && !event.target.closest("button, summary, input")) time.play(!time.state.playing);
     else return;
     event.preventDefault();
   }
@@ -77,52 +79,63 @@ export function open(place) {
     second.element.hidden = !values.run2;
     fill(beside, values.run2 ? "One alone" : "Another one beside it");
     newest.setAttribute("aria-pressed", String(Boolean(values.newest)));
-    rate.value = values.rate ?? "1";
+    rate.value = RATES.includes(values.rate) ? values.rate : "1";
     time.state.rate = Number(rate.value);
     follow.checked = values.follow !== "no";
     if (["run", "episode", "evaluation", "run2", "episode2", "evaluation2", "newest"].some((key) => values[key] !== before[key])) await load(false);
-    else if (values.step !== undefined && loaded.length) time.set(Number(values.step) * step_s());
+    else if (values.step !== undefined && loaded.length) time.set(wantedStep() * step_s());
     await driven(values);
   }
 
   /** Show a drive in the place of the replay, where the address says so. */
   async function driven(values) {
     const whether = Boolean(values.drive) && loaded.length > 0;
-    for (const part of [said, stages, lines, scrub, transport, details]) part.hidden = whether;
-    wheel.hidden = whether || !loaded.length;
-    if (drive && (!whether || drive.episode !== loaded[0])) drive.view.close(), (drive = null);
-    if (!whether) return;
-    time.play(false);
-    const { open: begin } = await import("../drive/view.js");
+    const driving = whether && (await part(() => import("../drive/view.js")).catch(({ message }) => undriven(message)));
     if (wanted !== values || left.signal.aborted) return;
-    drive ??= { episode: loaded[0], view: begin(cockpit, loaded[0], () => go(NO_DRIVE)) };
+    for (const element of [said, stages, lines, scrub, transport, details]) element.hidden = Boolean(driving);
+    wheel.hidden = whether || !loaded.length;
+    if (drive && (!driving || drive.episode !== loaded[0])) drive.view.close(), (drive = null);
+    if (!driving) return;
+    time.play(false);
+    drive ??= { episode: loaded[0], view: driving.open(cockpit, loaded[0], () => go(NO_DRIVE)) };
     drive.view.update(values);
+  }
+
+  /** The replay stays, with a sentence why nobody can drive, and both ways from here. */
+  function undriven(sentence) {
+    fill(said, fault(sentence), h("button", { type: "button", class: "main", onclick: () => (fill(said), driven(wanted)) }, "Try again"), " ",
+      h("button", { type: "button", onclick: () => (fill(said), go(NO_DRIVE)) }, "Back to the replay"));
   }
 
   async function load(playing) {
     const number_ = (asked += 1);
+    clearTimeout(rests);
     if (!wanted.run) return fill(stages, empty("Choose a run and an episode. Links of episodes lead here, also from queries and curves."));
     fill(said, loaded.length ? null : empty("Reading the episode …"));
     try {
       const found = [await replay(wanted.run, wanted.newest ? "" : (wanted.episode ?? 0), wanted.evaluation)];
       if (wanted.run2) found.push(await replay(wanted.run2, wanted.episode2 ?? 0, wanted.evaluation2));
+      const solid = await three();
       if (number_ !== asked || left.signal.aborted) return;
       fill(said);
-      await build(found);
+      build(found, solid);
       time.state.length_s = Math.max(...found.map((episode) => episode.time_s.at(-1)));
-      time.set(playing ? 0 : Number(wanted.step ?? 0) * step_s());
+      time.set(playing ? 0 : wantedStep() * step_s());
       time.play(playing);
     } catch (error) {
-      if (!left.signal.aborted && number_ === asked) fill(said, fault(error.message));
+      if (left.signal.aborted || number_ !== asked) return;
+      fill(said, fault(error.message), !(error instanceof Refusal) && h("button", { type: "button", class: "main", onclick: async () => (await load(false), driven(wanted)) }, "Try again"));
     }
   }
+
+  const wantedStep = () => (Number.isFinite(Number(wanted.step)) ? Number(wanted.step) : 0);
 
   function replay(name, episode, evaluation) {
     const query = new URLSearchParams(Object.entries({ episode, evaluation }).filter(([, value]) => value !== undefined && value !== ""));
     return get(`${path(name)}/replay?${query}`, left.signal);
   }
 
-  async function build(found) {
+  function build(found, solid) {
     views.forEach((one) => one.view.close());
     rows.forEach((line) => line.close());
     loaded = found;
@@ -132,7 +145,6 @@ export function open(place) {
       if (group) group.indices.push(k);
       else groups.push({ ground: episode.ground_id, indices: [k] });
     });
-    const solid = await three();
     views = groups.map(({ indices }) => {
       const tags = indices.map((k) => h("div", { class: letters[k] === "B" ? "second" : null }));
       const stage = h("div", { class: "stage", tabindex: "0", role: "group", "aria-label": "Scene: drag to turn, pinch or scroll to come nearer; arrows step, space plays" }, h("div", { class: "tag" }, tags), legend(found[indices[0]], solid));
@@ -155,14 +167,13 @@ export function open(place) {
 
   function shown(time_s) {
     if (!views.length) return;
-    const step = Math.floor(time_s / step_s() + 1e-6);
     for (const { view } of views) {
       if (time_s !== shown.before || told < 0) view.show(time_s);
       view.render();
     }
     if (time_s !== shown.before || told < 0) rows.forEach((line) => line.show(time_s));
     shown.before = time_s;
-    if (step !== told) tell(step, time_s);
+    if (step() !== told) tell(step(), time_s);
   }
 
   function tell(step, time_s) {
@@ -189,6 +200,8 @@ export function open(place) {
 
   return { update, close() {
     left.abort();
+    document.removeEventListener("keydown", keys);
+    clearTimeout(rests);
     drive?.view.close();
     time.close();
     views.forEach((one) => one.view.close());
@@ -199,11 +212,11 @@ export function open(place) {
 /** The drawing in three dimensions, null where the browser cannot. */
 async function three() {
   if (document.createElement("canvas").getContext("webgl2") === null) return null;
-  return import("./scene.js");
+  return part(() => import("./scene.js"));
 }
 
 function legend(episode, solid) {
-  return h("div", { class: "legend" }, solid && h("span", {}, "tension 0 ", h("i"), ` ${number(episode.brightest_n)} N, thicker as tighter`), h("span", {}, "on a triangle: Δ blue, Λ orange"), h("span", {}, "circle: waypoint"));
+  return h("div", { class: "legend" }, solid && h("span", {}, "tension 0 ", h("i"), ` ${number(episode.brightest_n)} N, thicker as tighter`), h("span", {}, "sign above a robot: its triangle, Δ blue, Λ orange"), h("span", {}, "circle: waypoint"));
 }
 
 function positions(episode, nodes) {

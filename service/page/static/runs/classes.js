@@ -7,11 +7,12 @@ import { className, number } from "../base/format.js";
 const SOON_MS = 200;
 const SQL = "SELECT * FROM classes WHERE iteration = $iteration ORDER BY segments DESC, kind, entry_edge, exit_edge";
 
-export function classes(name, signal) {
-  const which = h("input", { type: "number", min: 0, step: 1, onchange: () => (pinned = true, look()) });
+/** The list; `picked(iteration)` is told which iteration somebody wants to see, null for the newest. */
+export function classes(name, picked, signal) {
+  const which = h("input", { type: "number", min: 0, step: 1, onchange: () => picked(which.value === "" ? null : Number(which.value)) });
   const body = h("div", {}, empty("No iteration is committed yet."));
   const element = h("div", {}, field("Iteration", which), body);
-  let newest = -1, pinned = false, seen = false, waits = 0;
+  let newest = null, pinned = null, seen = false, waits = 0;
 
   async function look() {
     waits = 0;
@@ -32,11 +33,17 @@ export function classes(name, signal) {
 
   return {
     element,
-    opened: () => ((seen = true), newest >= 0 && look()),
+    opened: () => ((seen = true), look()),
+    choose(iteration) {
+      if (iteration === pinned) return;
+      pinned = iteration;
+      which.value = pinned ?? newest ?? "";
+      if (seen) look();
+    },
     iteration(committed) {
       newest = committed;
       which.max = newest;
-      if (pinned) return;
+      if (pinned !== null) return;
       which.value = newest;
       if (seen && element.isConnected) waits ||= setTimeout(look, SOON_MS); // many iterations may come at once
     },

@@ -6,8 +6,10 @@ import { empty, fault, fill, h, table } from "../base/dom.js";
 import { number } from "../base/format.js";
 
 const EVERY_MS = 10_000;
-const ALIKE = `SELECT run, run_seed AS seed, hash(*COLUMNS(lambda c: regexp_matches(c, '^(robot|terrain|task|learner|run)_')
-  AND c NOT IN ('run_seed', 'run_workers', 'run_workers_min', 'run_workers_max')))::VARCHAR AS alike
+const NO_SETTING = ["run", "study", "arm", "seed", "commit", "made_at", "schema_version"];
+const NO_EFFECT = ["run_workers", "run_workers_min", "run_workers_max", "run_cpus_per_worker", "terrain_accept"]; // on data
+const LEFT_OUT = [...NO_SETTING, ...NO_EFFECT, "run_seed"].map((name) => `'${name}'`).join(", ");
+const ALIKE = `SELECT run, run_seed AS seed, hash(*COLUMNS(lambda c: c NOT IN (${LEFT_OUT}) AND NOT starts_with(c, 'evaluation_')))::VARCHAR AS alike
   FROM runs WHERE list_contains($names, run) ORDER BY run`;
 const CURVES = `SELECT run, iteration, cost, forward_speed_m_per_s, stuck_share, stuck_share_by_distance FROM iterations
   WHERE list_contains($names, run) ORDER BY run, iteration`;
@@ -47,14 +49,16 @@ export function compare(names) {
 export function grouped(alike) {
   const groups = new Map();
   for (const run of alike) groups.set(run.alike, [...(groups.get(run.alike) ?? []), run]);
-  return [...groups.values()].map((runs) => ({ runs, names: new Set(runs.map((run) => run.run)), label: common(runs.map((run) => run.run)) }));
+  return [...groups.values()].map((runs) => ({ runs, names: new Set(runs.map((run) => run.run)), label: common(runs) }));
 }
 
-function common(names) {
+function common(runs) {
+  const names = runs.map((run) => run.run), seeds_n = new Set(runs.map((run) => run.seed)).size;
   if (names.length === 1) return names[0];
+  const many = seeds_n === names.length ? `${seeds_n} seeds` : `${names.length} runs, ${seeds_n} seed${seeds_n === 1 ? "" : "s"}`;
   let n = 0;
   while (names.every((name) => n < name.length && name[n] === names[0][n])) n += 1;
-  return `${names[0].slice(0, n).replace(/[-_.]?(seed)?[-_.]?$/, "") || names[0]} (${names.length} seeds)`;
+  return `${names[0].slice(0, n).replace(/[-_.]?(seed)?[-_.]?$/, "") || names[0]} (${many})`;
 }
 
 function lines(groups, curves, column) {

@@ -7,8 +7,9 @@ const KEPT_N = 500; // the file has all that are kept; a page that stays open fo
 const SIGNS = { start: "▶", scale: "⇕", crash: "✕", hang: "⏱", replacement: "↻", quarantine: "⊘", waiting: "…", running: "●", degraded: "◐", paused: "⏸", stopping: "◌", done: "✓", failed: "✕" };
 const BAD = new Set(["crash", "hang", "quarantine", "failed", "degraded"]);
 
-export function events() {
-  const kinds = select([["", "all"], ...Object.keys(SIGNS)], { onchange: draw });
+/** The list; `changed(kind)` is told which kind somebody wants to see, empty for all. */
+export function events(changed) {
+  const kinds = select([["", "all"], ...Object.keys(SIGNS)], { onchange: () => (changed(kinds.value), draw()) });
   const body = h("ol", { class: "events", reversed: true });
   const count = h("p", { class: "count" });
   const element = h("div", {}, field("Kind", kinds), count, body);
@@ -22,13 +23,21 @@ export function events() {
     fill(count, shown.length ? `${shown.length} events${kept.length === KEPT_N ? `, the newest of ${last + 1}` : ""}` : empty(kept.length ? "None of this kind." : "Nothing has happened to workers yet."));
   }
 
-  return { element, opened: draw, add(event) {
-    if (event.number <= last) return;
-    last = event.number;
-    kept.push(event);
-    if (kept.length > KEPT_N) kept.shift();
-    waits ||= setTimeout(draw, 100);
-  } };
+  return {
+    element,
+    opened: draw,
+    choose(kind) {
+      const next = Object.hasOwn(SIGNS, kind) ? kind : "";
+      if (next !== kinds.value) (kinds.value = next), draw();
+    },
+    add(event) {
+      if (event.number <= last) return;
+      last = event.number;
+      kept.push(event);
+      if (kept.length > KEPT_N) kept.shift();
+      waits ||= setTimeout(draw, 100);
+    },
+  };
 }
 
 function line(event) {

@@ -44,7 +44,7 @@ export function list({ changed, told, start, signal }) {
     if (!runs) return;
     const text = chosen.filter.toLowerCase();
     const shown = runs.filter((run) => run.name.toLowerCase().includes(text) && (!chosen.state || standing(run) === chosen.state));
-    shown.sort((ORDERS[chosen.order] ?? ORDERS.name)[1]);
+    shown.sort(ORDERS[chosen.order][1]);
     const wanted = shown.map((run) => row(run));
     const same = wanted.length === body.children.length && wanted.every((line, k) => line === body.children[k]);
     if (!same) fill(body, wanted); // only then: whoever has the focus in it keeps it
@@ -104,7 +104,7 @@ export function list({ changed, told, start, signal }) {
 
   repeatedly(EVERY_MS, look, signal);
   return { element, look, update(values) {
-    Object.assign(chosen, { filter: values.filter ?? "", state: values.state ?? "", order: values.order ?? "name", run: values.run ?? null, compare: new Set((values.compare ?? "").split(",").filter(Boolean)) });
+    Object.assign(chosen, { filter: values.filter ?? "", state: STATES.includes(values.state) ? values.state : "", order: Object.hasOwn(ORDERS, values.order ?? "") ? values.order : "name", run: values.run ?? null, compare: new Set((values.compare ?? "").split(",").filter(Boolean)) });
     filter.value = chosen.filter;
     states.value = chosen.state;
     orders.value = chosen.order;

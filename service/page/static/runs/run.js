@@ -22,8 +22,8 @@ export function run(name) {
   const reason = h("p", { class: "reason" });
   const said = h("div");
   const steer = steering(name, (status) => status && show(status));
-  const curves = learning((iteration) => (parts.episodes.choose(iteration), choose("episodes")));
-  const parts = { pool: pool(), events: events(), classes: classes(name, left.signal), episodes: episodes(name, left.signal) };
+  const curves = learning((iteration) => (pick(iteration), choose("episodes")));
+  const parts = { pool: pool(), events: events((kind) => note({ kind })), classes: classes(name, pick, left.signal), episodes: episodes(name, pick, left.signal) };
   const tabs = h("div", { class: "tabs", role: "tablist", "aria-label": "About this run" });
   const panel = h("div", { class: "panel", role: "tabpanel", id: "part", tabindex: "0" });
   const element = h("section", { "aria-label": `Run ${name}` }, h("div", { class: "title" }, h("h1", {}, name), state), reason, said, steer.element, curves.element, tabs, panel);
@@ -38,6 +38,12 @@ export function run(name) {
     const keys = Object.keys(PARTS);
     choose(keys[(keys.indexOf(part) + step + keys.length) % keys.length]);
     document.getElementById(`tab-${part}`).focus();
+  }
+
+  /** Look at an iteration, null for the newest. */
+  function pick(iteration) {
+    note({ iteration });
+    for (const part of [parts.classes, parts.episodes]) part.choose(iteration);
   }
 
   function choose(key) {
@@ -94,8 +100,9 @@ export function run(name) {
   return {
     element,
     update(values) {
-      open(values.part in PARTS ? values.part : "pool");
-      if (values.iteration !== undefined) parts.episodes.choose(Number(values.iteration));
+      open(Object.hasOwn(PARTS, values.part ?? "") ? values.part : "pool");
+      for (const part of [parts.classes, parts.episodes]) part.choose(/^\d+$/.test(values.iteration) ? Number(values.iteration) : null);
+      parts.events.choose(values.kind ?? "");
     },
     listed(runs) {
       listed = runs.find((one) => one.name === name) ?? null;
