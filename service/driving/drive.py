@@ -61,7 +61,7 @@ class Watch:
         self._waiting.append(news)
         self._some.set()
 
-    async def news(self, alive_s: float) -> AsyncIterator[News | None]:
+    async def news(self, quiet_s: float) -> AsyncIterator[News | None]:
         """What is told, up to `end`; None where nothing was for so long."""
         while True:
             while self._waiting:
@@ -71,7 +71,7 @@ class Watch:
                     return
             self._some.clear()
             try:
-                await asyncio.wait_for(self._some.wait(), alive_s)
+                await asyncio.wait_for(self._some.wait(), quiet_s)
             except TimeoutError:
                 yield None
 
