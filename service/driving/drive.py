@@ -61,7 +61,7 @@ class Watch:
         self._waiting.append(news)
         self._some.set()
 
-    async def news(self, alive_s: float) -> AsyncIterator[News | None]:
+    async def news(self, quiet_s: float) -> AsyncIterator[News | None]:
         """What is told, up to `end`; None where nothing was for so long."""
         while True:
             while self._waiting:
@@ -71,7 +71,7 @@ class Watch:
                     return
             self._some.clear()
             try:
-                await asyncio.wait_for(self._some.wait(), alive_s)
+                await asyncio.wait_for(self._some.wait(), quiet_s)
             except TimeoutError:
                 yield None
 
@@ -82,6 +82,7 @@ class Drive:
 
     def __init__(self, order: Order, patience: Patience, holds: Callable[[], bool], ended: Callable[[], None]) -> None:
         self._order, self._patience, self._holds, self._ended = order, patience, holds, ended
+        self._waypoint_m: list[float] | None = None
         self._watches: set[Watch] = set()
         self._scene: News | None = None
         self._last: News | None = None
@@ -102,13 +103,15 @@ class Drive:
             raise ConfigError(f"there are {self.robots_n} robots, counted from 0; robot {command.push.robot} is none")
         if command.terrain_difficulty is not None:
             order = order.at(command.terrain_difficulty)
-        half_m = order.half_size_m
-        if command.waypoint_m is not None and half_m is not None and max(map(abs, command.waypoint_m)) >= half_m:
+        waypoint_m, half_m = command.waypoint_m or self._waypoint_m, order.half_size_m
+        if waypoint_m is not None and half_m is not None and max(map(abs, waypoint_m)) >= half_m:
+            place = ", ".join(f"{value:.1f}" for value in waypoint_m)
+            ground, remedy = ("the", "choose") if command.waypoint_m else ("that", "before it changes, head for")
             raise ConfigError(
-                f"the waypoint ({', '.join(f'{value:.1f}' for value in command.waypoint_m)}) lies beyond the ground, "
-                f"which reaches {half_m:.0f} m from its middle; choose a nearer one"
+                f"the waypoint ({place}) lies beyond {ground} ground, which reaches {half_m:.0f} m from its middle; "
+                f"{remedy} a nearer one"
             )
-        self._order = order
+        self._order, self._waypoint_m = order, waypoint_m
         self._asked.put_nowait(command)
         self._tell(News("steered", command.model_dump_json(exclude_none=True)))
 

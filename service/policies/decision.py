@@ -2,7 +2,8 @@
 
 It is `support.support_face`, `support.enter`, `symmetry.frame_yaw`, `observation.observe` and the policy's network in
 one function without branches: a choice is a row of a constant table (`tables`). Geometry is computed with 64 bits, as
-in the simulator, and the network with 32. `policy.h` computes the same in C.
+in the simulator, and the network with 32. `policy.h` computes the same in C. A number that is not finite gives commands
+that are NaN, and leaves the state.
 
 x, y, z    places of the nodes about the centre of mass, z above the ground's zero [12] (m)
 g, f       symmetry element of the frame, support triangle
@@ -118,7 +119,15 @@ def decide(ops: Ops[T], table: Mapping[str, T], given: Inputs[T], network: Netwo
     if network.seen_n > SENSORS_N:
         parts.append(_turned_nodes(ops, table, g, side, c, s, (x, y, z - height)))
     commands = _commands(ops, network, ops.single(ops.joined(parts)))
-    return ops.take(commands, ops.take(table["cable_map"], g)), ops.stack([f, g])
+    lost = _lost(ops, given)
+    after = ops.where(lost >= 0, ops.stack([f, g]), given.state)
+    return ops.take(commands, ops.take(table["cable_map"], g)) + lost, after
+
+
+def _lost(ops: Ops[T], given: Inputs[T]) -> T:
+    """Zero, or NaN where a number that is measured is not finite."""
+    measured = [given.nodes, given.com_velocity, given.bar_angular_velocities, given.rest_lengths, given.waypoint]
+    return ops.sum(ops.joined(measured) * 0)
 
 
 def _face(ops: Ops[T], table: Mapping[str, T], x: T, y: T, z: T, height: T) -> T:

@@ -43,7 +43,10 @@ class Driver(Protocol):
         """What its file says of it."""
 
     def decide(self, measured: Measurement, state: State) -> tuple[Array, State]:
-        """Rest lengths to command [24] (m) for one control period, and the state [2] for the next decision."""
+        """Rest lengths to command [24] (m) for one control period, and the state [2] for the next decision.
+
+        Where a number that is measured is not finite, the commands are NaN and the state is that of before.
+        """
 
 
 def measured(state: RobotState, waypoint: tuple[float, float]) -> Measurement:

@@ -184,8 +184,21 @@ static inline void t6gps_tanh(float *x, int n) {
     }
 }
 
-/* Rest lengths to command for one control period (m), in the order of t6gps_cables; `state` becomes the next. */
+/* True where a number is not finite: infinity and NaN less themselves are no zero. */
+static inline int t6gps_lost(const t6gps_measurement *measured) {
+    const double *values = (const double *)measured;
+    int lost = 0;
+    for (unsigned i = 0; i < sizeof *measured / sizeof *values; i++) lost |= values[i] - values[i] != 0;
+    return lost;
+}
+
+/* Rest lengths to command for one control period (m), in the order of t6gps_cables; `state` becomes the next. Where a
+ * number is not finite, all commands are NaN and `state` stays. */
 static inline void t6gps_decide(const t6gps_measurement *measured, t6gps_state *state, double commands[24]) {
+    if (t6gps_lost(measured)) {
+        for (int cable = 0; cable < T6GPS_CABLES; cable++) commands[cable] = NAN;
+        return;
+    }
     double com[3];
     for (int i = 0; i < 3; i++) {
         com[i] = 0;

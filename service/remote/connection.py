@@ -18,7 +18,7 @@ import pyarrow as pa
 from pydantic import BaseModel, JsonValue, TypeAdapter, ValidationError
 
 from t6gps.service.remote.messages import WAIT_S, WARNINGS, Refusal
-from t6gps.service.remote.stream import Update, parsed
+from t6gps.service.remote.stream import REFUSED, Update, parsed
 from t6gps.storage.errors import (
     CheckpointError,
     ConfigError,
@@ -93,9 +93,15 @@ class Connection:
             yield from answer.iter_bytes()
 
     def events(self, path: str, last: str) -> Iterator[Update]:
-        """Events of a stream after `last`, until the server ends it. ServerError where the connection breaks."""
+        """Events of a stream after `last`, until the server ends it.
+
+        ServerError where the connection breaks, or the token does not hold any more.
+        """
         with self._streamed("GET", path, headers={"Last-Event-ID": last}) as answer:
-            yield from parsed(answer.iter_lines())
+            for update in parsed(answer.iter_lines()):
+                if update.kind == REFUSED:
+                    raise ServerError(str(update.data))
+                yield update
 
     @contextmanager
     def _streamed(

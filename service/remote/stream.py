@@ -10,6 +10,8 @@ from pydantic import JsonValue
 
 START = "0-0"
 """The id of who has been told nothing."""
+REFUSED = "refused"
+"""The last event of a stream whose token holds no more; its data is the reason."""
 
 
 @dataclass(frozen=True)
@@ -17,7 +19,8 @@ class Update:
     """One event of a stream: something that happened to a run, or a frame of a drive.
 
     kind   of a run: iteration, with a row of the table `iterations`; pool, with an event; status, with a status; fault,
-           with a sentence. Of a drive: scene, frame, steered, end (docs/server.md)
+           with a sentence. Of a drive: scene, frame, steered, end (docs/server.md). Of both: refused, with a
+           sentence, which the client raises
     id     where a stream may be resumed, so that each comes once; None where it may not
     """
 

@@ -12,25 +12,20 @@ from __future__ import annotations
 
 import asyncio
 import json
-import time
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 
 from t6gps.service.server.feed import LOOK_S, Cursor, Feeds, News
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import T6GpsError
 
-ALIVE_S = 15.0
-ALIVE = ": alive\n\n"
 
-
-async def stream(feeds: Feeds, run: Run, cursor: Cursor, look_s: float = LOOK_S) -> AsyncIterator[str]:
-    """Events of a run after a cursor, as they come, for as long as somebody listens."""
-    condition, spoken_s = "", time.monotonic()
-    yield ALIVE
+async def stream(feeds: Feeds, run: Run, cursor: Cursor) -> AsyncGenerator[str | None, None]:
+    """Events of a run after a cursor, as they come, for as long as somebody listens; None after each look."""
+    condition = ""
     with feeds.of(run) as feed:
         while True:
             try:
-                await feed.look(look_s)
+                await feed.look(LOOK_S)
             except T6GpsError as error:
                 yield _text(News("fault", str(error)))
                 return
@@ -38,11 +33,8 @@ async def stream(feeds: Feeds, run: Run, cursor: Cursor, look_s: float = LOOK_S)
             for news in told:
                 cursor = news.cursor or cursor
                 yield _text(news)
-                spoken_s = time.monotonic()
-            if time.monotonic() - spoken_s > ALIVE_S:
-                yield ALIVE
-                spoken_s = time.monotonic()
-            await asyncio.sleep(look_s)
+            yield None
+            await asyncio.sleep(LOOK_S)
 
 
 def _text(news: News) -> str:

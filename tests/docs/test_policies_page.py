@@ -65,6 +65,22 @@ def test_the_c_of_the_page_compiles_and_commands_the_cables(folder: Path) -> Non
     assert np.allclose([float(value) for _, value in lines], wanted, rtol=0, atol=1e-9)
 
 
+def test_topics_of_the_node_are_those_of_the_table_and_names_that_ros_2_takes() -> None:
+    (node,) = blocks("py")
+    kinds = re.findall(r"\w+", " ".join(re.findall(r"^from \w+\.msg import (.*)$", node, re.M)))
+    names: dict[str, object] = dict.fromkeys(kinds)
+    exec("\n".join(line for line in node.splitlines() if re.match(r"(TOPICS|BARS) = ", line)), names)
+    published = re.findall(r'create_publisher\(\w+, "([^"]+)"', node)
+    topics = [*names["TOPICS"], *names["BARS"], *published]  # type: ignore[misc]
+    written = re.findall(r"`(/\w[\w/]*)`", "".join(re.findall(r"^\| (`/[^|]*)\|", PAGE, re.M)))
+    assert {*written} == {*topics} - {f"/bar_{bar}" for bar in range(1, 5)}, "the table has the first and the last bar"
+    assert len({*topics}) == 5 + 6
+    for topic in topics:  # rmw_validate_full_topic_name, and the rules for names that an application gives
+        assert re.fullmatch(r"(/[A-Za-z_][A-Za-z0-9_]*)+", topic), topic
+        assert "__" not in topic, topic
+        assert len(topic) <= 247, topic
+
+
 def test_the_node_of_the_page_is_python_and_names_what_there_is() -> None:
     (node,) = blocks("py")
     compile(node, "policies.md", "exec")

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import threading
 from collections import Counter
-from collections.abc import AsyncIterator, Awaitable, Callable, Iterable, Iterator
+from collections.abc import Awaitable, Callable, Iterable, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from http import HTTPStatus
@@ -13,11 +13,8 @@ from queue import SimpleQueue
 from typing import Annotated, TypeAlias, cast, final
 
 from fastapi import Depends, HTTPException, Path, Request
-from fastapi.responses import StreamingResponse
 from fastapi.security import HTTPBearer
 from pydantic import JsonValue
-from starlette.types import Receive, Send
-from starlette.types import Scope as ASGIScope
 
 from t6gps.service.driving.drives import Drives
 from t6gps.service.launch import job as records
@@ -84,24 +81,6 @@ class Slots:
             yield
         finally:
             self.give_back()
-
-
-@final
-class EventStream(StreamingResponse):
-    """A stream of server-sent events, which gives its slot back however it ends."""
-
-    media_type = "text/event-stream"
-
-    def __init__(self, events: AsyncIterator[str], slots: Slots) -> None:
-        super().__init__(events, headers={"Cache-Control": "no-store"})
-        self._slots = slots
-
-    async def __call__(self, scope: ASGIScope, receive: Receive, send: Send) -> None:
-        """Send it."""
-        try:
-            await super().__call__(scope, receive, send)
-        finally:
-            self._slots.give_back()
 
 
 @final

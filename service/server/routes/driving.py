@@ -5,7 +5,7 @@ Commands change nothing that is kept, so that they have no line in the audit; wh
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
+from collections.abc import AsyncGenerator
 from http import HTTPStatus
 from typing import Annotated
 
@@ -22,7 +22,6 @@ from t6gps.service.remote.messages import DriveBegun, DriveRequest
 from t6gps.service.server.routes.access import (
     REFUSALS,
     Asker,
-    EventStream,
     Operating,
     Operation,
     Place,
@@ -30,7 +29,7 @@ from t6gps.service.server.routes.access import (
     contents,
     named,
 )
-from t6gps.service.server.updates import ALIVE, ALIVE_S
+from t6gps.service.server.routes.streaming import CHECK_S, EventStream
 
 routes = APIRouter(prefix="/v1/drives", responses=REFUSALS, tags=["drive"])
 
@@ -70,10 +69,9 @@ async def begin(operation: Operation, request: DriveRequest, place: Place, asker
     response_class=StreamingResponse,
     responses=contents(["text/event-stream"], "Events."),
 )
-async def frames(found: UnderWay, place: Place) -> StreamingResponse:
+async def frames(found: UnderWay, place: Place, asker: Asker) -> StreamingResponse:
     """What is seen, as server-sent events: scene, frame ten times a second, steered, and end with the reason."""
-    place.streams.take()
-    return EventStream(_events(found.drive), place.streams)
+    return EventStream(place, asker, _events(found.drive))
 
 
 @routes.post("/{drive}", dependencies=[Operating], status_code=HTTPStatus.NO_CONTENT)
@@ -91,8 +89,7 @@ async def end(operation: Operation, found: UnderWay, asker: Asker) -> None:
     await found.drive.end(f"token {asker.name!r} has ended this drive; begin another one")
 
 
-async def _events(drive: Drive) -> AsyncIterator[str]:
-    yield ALIVE
+async def _events(drive: Drive) -> AsyncGenerator[str | None, None]:
     with drive.watched() as watch:
-        async for news in watch.news(ALIVE_S):
-            yield ALIVE if news is None else f"event: {news.kind}\ndata: {news.text}\n\n"
+        async for news in watch.news(CHECK_S):
+            yield None if news is None else f"event: {news.kind}\ndata: {news.text}\n\n"

@@ -12,7 +12,8 @@ from t6gps.service.remote.messages import CursorText
 from t6gps.service.remote.stream import START
 from t6gps.service.server import updates
 from t6gps.service.server.feed import Cursor
-from t6gps.service.server.routes.access import REFUSALS, EventStream, Name, NamedRun, Place, Reading, contents, named
+from t6gps.service.server.routes.access import REFUSALS, Asker, Name, NamedRun, Place, Reading, contents, named
+from t6gps.service.server.routes.streaming import EventStream
 from t6gps.service.steering import events as happened
 from t6gps.service.steering import status as statuses
 from t6gps.service.steering.events import Event
@@ -59,8 +60,8 @@ def history(run: NamedRun, place: Place) -> list[Event]:
 async def events(
     run: NamedRun,
     place: Place,
+    asker: Asker,
     last_event_id: Annotated[CursorText, Header()] = START,
 ) -> StreamingResponse:
     """Live updates as server-sent events: iterations and events of the pool with their ids, changes of the status."""
-    place.streams.take()
-    return EventStream(updates.stream(place.feeds, run, Cursor.of(last_event_id)), place.streams)
+    return EventStream(place, asker, updates.stream(place.feeds, run, Cursor.of(last_event_id)))

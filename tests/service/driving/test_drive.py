@@ -11,7 +11,7 @@ def told(watch: Watch) -> list[News | None]:
     """All that a watch has to tell, up to the end."""
 
     async def collected() -> list[News | None]:
-        return [news async for news in watch.news(alive_s=0.01)]
+        return [news async for news in watch.news(quiet_s=0.01)]
 
     return asyncio.run(collected())
 
@@ -31,8 +31,8 @@ def test_who_is_slow_misses_the_oldest_frames_and_nothing_else() -> None:
     assert len(found) == WAITING_N
 
 
-def test_who_looks_while_nothing_happens_hears_that_the_drive_is_alive() -> None:
+def test_who_looks_while_nothing_happens_is_told_so() -> None:
     async def first() -> News | None:
-        return await anext(Watch().news(alive_s=0.01))
+        return await anext(Watch().news(quiet_s=0.01))
 
     assert asyncio.run(first()) is None

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 
 import numpy as np
+import pytest
 from exported_policies import Material
 
 from t6gps.service.policies import tables
@@ -118,6 +119,22 @@ def test_at_the_waypoint_and_beside_any_triangle_commands_are_finite(material: M
     robot = tumbled(np.random.default_rng(1))
     found, _ = material.drivers[form].decide(measured(robot, (robot.com[0], robot.com[1])), START)
     assert np.isfinite(found).all()
+
+
+@pytest.mark.parametrize("lost", [np.nan, np.inf, -np.inf])
+def test_one_number_that_is_not_finite_gives_no_commands_and_leaves_the_state(
+    material: Material, form: Format, lost: float
+) -> None:
+    robot, before = tumbled(np.random.default_rng(2)), np.array([3, 8])
+    given = measured(robot, (3.0, 1.0))
+    sizes = [np.size(part) for part in vars(given).values()]
+    for number in range(sum(sizes)):
+        values = np.concatenate([np.ravel(part) for part in vars(given).values()])
+        values[number] = lost
+        parts = zip(np.split(values, np.cumsum(sizes)[:-1]), vars(given).values(), strict=True)
+        commands, after = material.drivers[form].decide(Measurement(*(a.reshape(b.shape) for a, b in parts)), before)
+        assert np.isnan(commands).all(), number
+        assert np.array_equal(after, before)
 
 
 def test_an_episode_driven_by_a_file_is_that_of_the_policy(material: Material, form: Format) -> None:

@@ -20,7 +20,7 @@ from t6gps.storage.errors import DataError
 
 STORE = get_typestore(Stores.ROS2_JAZZY)
 NODES, COM, CABLES, WAYPOINT, COMMANDS = "/nodes", "/com", "/cables", "/waypoint", "/commands"
-BARS = [f"/bars/{bar}" for bar in range(6)]
+BARS = [f"/bar_{bar}" for bar in range(6)]
 
 
 def message(kind: str, **fields: object) -> Any:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import os
 from collections.abc import Callable, Iterator
 from dataclasses import replace
-from datetime import UTC, datetime, timedelta
+from datetime import UTC, datetime
 from itertools import pairwise
 from pathlib import Path
 
@@ -155,15 +155,45 @@ def test_a_drive_that_nobody_looks_at_ends(server: Server, wait_until: Callable[
         wait_until(lambda: not children(), LONG_S)
 
 
-def test_a_drive_ends_with_the_token_that_began_it(server: Server, client: Client) -> None:
+def issued(server: Server, name: str, scope: Scope) -> Client:
+    """A client with a token of its own."""
+    asked = TokenRequest(name=name, scope=scope, days=1.0)
+    return Client(server.url, tokens.issue(server.root, asked, datetime.now(UTC)).token)
+
+
+def test_who_looks_does_so_with_a_token_that_holds_and_a_drive_ends_with_the_one_that_began_it(
+    server: Server, client: Client
+) -> None:
+    with issued(server, "driver", Scope.OPERATE) as driver, issued(server, "guest", Scope.READ) as guest:
+        drive = driver.drives.begin([("walk", 1)], 0)
+        frames, seen = client.drives.frames(drive), guest.drives.frames(drive)
+        until(seen, frame(0))
+        driver.drives.steer(drive, paused=True)
+        tokens.revoke(server.root, "guest")
+        with pytest.raises(ServerError, match="token 'guest' is revoked or has expired; ask for another one"):
+            until(seen, lambda update: update.kind == "end")
+        with pytest.raises(ServerError, match="not known here"):
+            next(guest.drives.frames(drive))
+        driver.drives.steer(drive, paused=False)
+        until(frames, frame(0, 0.2))
+        tokens.revoke(server.root, "driver")
+        assert "revoked or has expired" in until(frames, lambda update: update.kind == "end").data
+
+
+def test_a_ground_that_ends_before_the_waypoint_is_refused(server: Server, client: Client) -> None:
     drive = client.drives.begin([("walk", 1)], 0)
     frames = client.drives.frames(drive)
     until(frames, frame(0))
-    server.later = timedelta(days=2)
-    try:
-        assert "revoked or has expired" in until(frames, lambda update: update.kind == "end").data
-    finally:
-        server.later = timedelta()
+    client.drives.steer(drive, waypoint_m=[100.0, 0.0])
+    said = r"waypoint \(100\.0, 0\.0\) lies beyond that ground, which reaches 20 m.*before it changes, head for"
+    with pytest.raises(ConfigError, match=said):
+        client.drives.steer(drive, terrain_difficulty=0.5)
+    client.drives.steer(drive, waypoint_m=[10.0, 0.0], terrain_difficulty=0.5)
+    client.drives.steer(drive, terrain_difficulty=0.0)
+    client.drives.steer(drive, waypoint_m=[100.0, 0.0])
+    heard = [until(frames, lambda update: update.kind == "steered").data for _ in range(4)]
+    assert [command.get("waypoint_m") for command in heard] == [[100.0, 0.0], [10.0, 0.0], None, [100.0, 0.0]]
+    client.drives.end(drive)
 
 
 def test_others_look_on_and_steer_nothing(server: Server, client: Client) -> None:

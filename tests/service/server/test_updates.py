@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import socket
 from collections.abc import Callable, Iterable, Iterator
+from datetime import timedelta
 from itertools import islice
 from pathlib import Path
 from urllib.parse import urlsplit
@@ -17,6 +18,7 @@ from t6gps.service.remote.client import Client
 from t6gps.service.remote.connection import UnreachableError
 from t6gps.service.remote.messages import Scope
 from t6gps.service.remote.stream import START, Update, parsed
+from t6gps.service.server import tokens
 from t6gps.service.server.routes.access import STREAMS_N
 from t6gps.service.steering.events import EventKind, EventLog, Happened
 from t6gps.storage.errors import RunError, ServerError
@@ -102,6 +104,34 @@ def test_listeners_share_what_was_seen_and_each_hears_it_all(
         for stream in streams:
             assert {next(stream).kind, next(stream).kind} == {"iteration", "pool"}
             stream.close()
+
+
+def test_a_stream_ends_with_its_token_also_where_nothing_happens(server: Server) -> None:
+    with server.client(Scope.READ) as client, server.client(Scope.OPERATE) as other:
+        streams = [client.events("walk"), following.updates(client, "walk"), other.events("walk")]
+        assert [[next(stream).id for _ in range(2)] for stream in streams] == [["1-0", "2-0"]] * 3
+        tokens.revoke(server.root, "read")
+        for stream in streams[:2]:
+            with pytest.raises(ServerError, match="token 'read' is revoked or has expired; ask for another one"):
+                next(stream)
+        with pytest.raises(ServerError, match="not known here; ask for another one"):
+            next(client.events("walk"))
+        server.later = timedelta(days=2)
+        with pytest.raises(ServerError, match="token 'operate' is revoked or has expired"):
+            next(streams[2])
+        with pytest.raises(ServerError, match="token 'operate' expired at"):
+            next(other.events("walk"))
+
+
+def test_a_stream_ends_where_tokens_cannot_be_read_any_more(server: Server) -> None:
+    with server.client(Scope.READ) as client:
+        stream = client.events("walk")
+        assert [next(stream).id for _ in range(2)] == ["1-0", "2-0"]
+        book = server.root / tokens.FOLDER / "tokens.json"
+        book.chmod(0o644)
+        book.touch()
+        with pytest.raises(ServerError, match="the server cannot read its tokens; see its log"):
+            next(stream)
 
 
 def test_a_stream_of_a_run_that_does_not_exist_is_refused(server: Server) -> None:
