@@ -76,7 +76,7 @@ def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[
     """
     _check_same(draft, copy, {fault.part for fault in faults})
     spoilt = {fault.place for fault in unsound}
-    sentences, taken = [], list[str]()
+    sentences, taken = list[str](), list[str]()
     for place in sorted({fault.place for fault in faults}):
         source = copy.path / place
         if place in spoilt or not source.exists() or any(place.startswith(f"{whole}/") for whole in taken):

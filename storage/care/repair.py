@@ -101,7 +101,8 @@ def _put_in_place(draft: Path, run: Path) -> None:
             _make_way(run / place, run)
             (draft / place).replace(run / place)
     for place in sorted(there - wanted, reverse=True):
-        (run / place).unlink(missing_ok=True)
+        if not (run / place).is_dir():  # which it has become by now
+            (run / place).unlink(missing_ok=True)
     for folder in (path for path in sorted(draft.rglob("*")) if path.is_dir()):
         (run / folder.relative_to(draft)).mkdir(exist_ok=True)
     for folder in sorted((path for path in run.rglob("*") if path.is_dir()), reverse=True):

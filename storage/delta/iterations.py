@@ -86,7 +86,7 @@ def committed(run: Run) -> int:
         return 0
     episodes = log.opened(run, "episodes")  # once more: iterations may have been committed meanwhile
     if episodes is None:
-        of = f"{name} has {others[name]} iterations" if others[name] > 1 else f"a checkpoint follows {finished_n}"
+        of = f"{name} has {others[name]} iterations" if others[name] > 1 else f"a checkpoint has {finished_n}"
         raise log.damaged(run, "episodes", f"it is missing, and {of}")
     return log.committed(episodes)
 
