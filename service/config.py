@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING
 from pydantic import BaseModel, Field, JsonValue, ValidationError, model_validator
 
 from t6gps.learner.settings import LearnerSettings, Localization
+from t6gps.storage import durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import ConfigError
 from t6gps.storage.objects import place
@@ -166,8 +167,8 @@ def with_ground(config: Config, file: Path) -> Config:
 def parse(text: str, overrides: Sequence[str] = (), where: str = "config.json") -> Config:
     """Configuration that a run keeps (`Config.to_json`), with overrides. ConfigError as for `load`."""
     try:
-        values = json.loads(text)
-    except json.JSONDecodeError as error:
+        values = durable.parsed(text)
+    except ValueError as error:
         raise ConfigError(f"{where} is not JSON: {error}; restore the file from a copy") from None
     if not isinstance(values, dict):
         raise ConfigError(f"{where} is not a configuration: found a {type(values).__name__}; restore it from a copy")

@@ -14,6 +14,7 @@ import hashlib
 import io
 import json
 import logging
+import re
 import shutil
 import zipfile
 from collections.abc import Mapping
@@ -30,6 +31,7 @@ JSON: TypeAlias = "dict[str, JSON] | list[JSON] | str | int | float | bool | Non
 Arrays: TypeAlias = dict[str, NDArray[Any]]
 
 KEPT_N = 3
+_NAME = re.compile(r"iteration-[0-9]{6}")
 _log = logging.getLogger(__name__)
 
 
@@ -39,7 +41,7 @@ def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Map
     A checkpoint of the same iteration is replaced; those before the last three are removed. Raises
     CheckpointError when the manifest is not finite JSON or an array holds Python objects.
     """
-    path = folder / f"iteration-{iteration:06d}"
+    path = place_of(folder, iteration)
     try:
         archive = packed(arrays)
         record = {"iteration": iteration, "manifest": dict(manifest), "sha256": {"arrays.npz": _sum(archive)}}
@@ -68,9 +70,7 @@ def load(path: Path) -> tuple[int, dict[str, JSON], Arrays]:
 
     Raises CheckpointError naming the file that is missing, torn or altered.
     """
-    done = _bytes(path, "DONE").decode(errors="replace")
-    text = _verified(path, "manifest.json", done)
-    record = json.loads(text)
+    record = _record(path, _verified(path, "manifest.json", _done(path)))
     content = _verified(path, "arrays.npz", record["sha256"]["arrays.npz"])
     with np.load(io.BytesIO(content), allow_pickle=False) as archive:
         arrays = {name: archive[name] for name in archive.files}
@@ -102,9 +102,20 @@ def kept(folder: Path) -> dict[int, Path]:
     return {int(path.name.removeprefix("iteration-")): path for path in _found(folder)}
 
 
+def manifest(path: Path) -> dict[str, JSON]:
+    """The manifest of the checkpoint in the folder `path`, whose arrays are not read. CheckpointError as `load`."""
+    found: dict[str, JSON] = _record(path, _verified(path, "manifest.json", _done(path)))["manifest"]
+    return found
+
+
+def place_of(folder: Path, iteration: int) -> Path:
+    """The folder, under `folder`, of the checkpoint after that many iterations."""
+    return folder / f"iteration-{iteration:06d}"
+
+
 def _found(folder: Path) -> list[Path]:
-    """The folders of all checkpoints, the newest first."""
-    return sorted(folder.glob("iteration-*"), reverse=True)
+    """The folders of all checkpoints, the newest first. Whatever else lies there is none, such as a copy of one."""
+    return sorted((path for path in folder.glob("iteration-*") if _NAME.fullmatch(path.name)), reverse=True)
 
 
 def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
@@ -115,6 +126,20 @@ def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
             with archive.open(f"{name}.npy", "w", force_zip64=True) as file:
                 np.lib.format.write_array(file, np.asanyarray(array), allow_pickle=False)
     return buffer.getvalue()
+
+
+def _done(path: Path) -> str:
+    return _bytes(path, "DONE").decode(errors="replace")
+
+
+def _record(path: Path, text: bytes) -> dict[str, Any]:
+    """What a manifest of that sum says: who altered both may have written anything."""
+    try:
+        record: dict[str, Any] = durable.parsed(text)
+        record["iteration"], record["manifest"].keys(), record["sha256"]["arrays.npz"]
+    except (ValueError, TypeError, LookupError, AttributeError) as error:
+        raise CheckpointError(f"checkpoint {path}: manifest.json is none: {error!r}") from None
+    return record
 
 
 def _sum(content: bytes) -> str:

@@ -2,25 +2,31 @@
 
 A file or folder that one process alone writes has one hidden name (`hidden`, `publish`). A folder that several
 processes may make at once is built in a `draft` of its own; one rename gives it its name, or finds the name taken.
+Whoever reads a file of JSON back takes it for anything (`parsed`).
 """
 
 from __future__ import annotations
 
 import errno
 import hashlib
+import json
 import logging
 import os
 import secrets
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from contextlib import contextmanager
 from pathlib import Path
+from typing import Any
 
 _PARTIAL, _DISCARDED = ".partial", ".discarded"
 _ABANDONED_S = 24 * 3600.0
 """A draft in which nothing has been made for so long belongs to no process."""
 _TAKEN = (errno.EEXIST, errno.ENOTEMPTY, errno.ENOTDIR)
 """How a rename says that its target is there: a folder that holds something, or no folder."""
+DEEPEST_N = 100
+"""Brackets in each other in a file of a run, whose own have less than ten: deeper ones exhaust the stack of readers."""
+_DEEP = f"it has brackets more than {DEEPEST_N} deep"
 _log = logging.getLogger(__name__)
 
 
@@ -43,6 +49,25 @@ def sha256(file: Path) -> str:
     """The SHA-256 of a file's content, which is read in pieces."""
     with file.open("rb") as content:
         return hashlib.file_digest(content, "sha256").hexdigest()
+
+
+def parsed(text: str | bytes) -> Any:
+    """What JSON says. ValueError for text that is none, or has brackets more than DEEPEST_N deep."""
+    try:
+        value = json.loads(text)
+    except RecursionError:
+        raise ValueError(_DEEP) from None
+    level: list[object] = [value]
+    for _ in range(DEEPEST_N):
+        level = [part for whole in level for part in _parts(whole)]
+        if not level:
+            return value
+    raise ValueError(_DEEP)
+
+
+def _parts(value: object) -> Iterable[object]:
+    """What a list or an object of JSON holds."""
+    return value if isinstance(value, list) else value.values() if isinstance(value, dict) else ()
 
 
 def link(source: str | Path, target: str | Path) -> None:

@@ -7,6 +7,7 @@ hidden name and then renamed, so that an episode is there whole or not at all.
 from __future__ import annotations
 
 import logging
+import re
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -17,6 +18,7 @@ from t6gps.storage.errors import DataError
 from t6gps.storage.objects import place
 from t6gps.storage.records import Episode
 
+_NAME = re.compile(r"iteration-[0-9]{6}")
 _log = logging.getLogger(__name__)
 
 
@@ -51,9 +53,19 @@ def read(path: Path) -> Episode:
     return Episode(*ipc.unpack(source, 2))
 
 
+def files(folder: Path) -> list[Path]:
+    """The files of a run's spool, by iteration. Whatever else lies there is none, such as the copy of a folder."""
+    return sorted(path for path in folder.glob("iteration-*/episode-*.arrow") if _NAME.fullmatch(path.parent.name))
+
+
+def iteration_of(file: Path) -> int:
+    """The iteration in whose folder a file of a spool lies."""
+    return int(file.parent.name.removeprefix("iteration-"))
+
+
 def newest(folder: Path) -> Episode | None:
     """The episode that came last of those in a run's spool, for who only looks; None where none waits there."""
-    for path in sorted(folder.glob("iteration-*/episode-*.arrow"), key=_came, reverse=True):
+    for path in sorted(files(folder), key=_came, reverse=True):
         try:
             return read(path)
         except FileNotFoundError:  # committed meanwhile
@@ -63,7 +75,9 @@ def newest(folder: Path) -> Episode | None:
 
 def waiting(folder: Path, episode_id: int) -> Episode | None:
     """An episode that waits in a run's spool, for who only looks; None where it does not."""
-    for path in folder.glob(f"iteration-*/episode-{episode_id:012d}.arrow"):
+    for path in files(folder):
+        if path.name != f"episode-{episode_id:012d}.arrow":
+            continue
         try:
             return read(path)
         except FileNotFoundError:  # committed meanwhile
@@ -130,7 +144,7 @@ class Spool:
     def clear(self) -> None:
         """Forget the episodes of this iteration, and of earlier ones whose clearing was cut off."""
         for folder in sorted(self._root.glob("iteration-*")):
-            if folder.name <= self._folder.name:
+            if _NAME.fullmatch(folder.name) and folder.name <= self._folder.name:
                 durable.discard(folder)
         durable.sweep(self._root)
         self._folder.mkdir()

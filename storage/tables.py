@@ -27,11 +27,17 @@ def committed_iterations(run: Run) -> int:
 
 def files(run: Run, names: Collection[str] = schema.TABLES.keys()) -> dict[str, Files]:
     """The Parquet files of tables, by default of all. DataError where one of them is missing or damaged."""
-    return dict(_files(run, frozenset(names), log.state(run)))
+    state = log.state(run)
+    # A run whose tables are lost looks as it did before the first iteration.
+    return _files(run, frozenset(names)) if not any(state) else dict(_known_files(run, frozenset(names), state))
 
 
 @lru_cache(KNOWN_RUNS_N)
-def _files(run: Run, names: frozenset[str], state: object) -> dict[str, Files]:
+def _known_files(run: Run, names: frozenset[str], state: object) -> dict[str, Files]:
+    return _files(run, names)
+
+
+def _files(run: Run, names: frozenset[str]) -> dict[str, Files]:
     iterations_n, evaluated = iterations.committed(run), log.opened(run, "evaluations")
     return {
         **{name: iterations.files(run, name, iterations_n) for name in schema.OF_ITERATIONS if name in names},

@@ -6,7 +6,6 @@ Runs of all versions stand in it. What a run's version did not know is null.
 from __future__ import annotations
 
 import enum
-import json
 import types
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
@@ -15,9 +14,8 @@ from typing import Annotated, TypeAlias, Union, get_args, get_origin
 import pyarrow as pa
 
 from t6gps.service import config as configuration
-from t6gps.service.studies import origin as studies
-from t6gps.service.training import evaluation, origin
-from t6gps.storage import catalog
+from t6gps.service.training import evaluation, origin, study_origin
+from t6gps.storage import catalog, durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 from t6gps.storage.fields import scalar
@@ -65,8 +63,8 @@ def of_run(run: Run, sql: str, parameters: Parameters) -> Question:
 def _row(run: Run) -> Mapping[str, object]:
     """The row of a run. RunError where what it is made of cannot be read."""
     try:
-        settings = json.loads(run.config_path.read_bytes())
-        study, made = studies.origin(run), origin.kept(run)
+        settings = durable.parsed(run.config_path.read_bytes())
+        study, made = study_origin.origin(run), origin.kept(run)
         row = {
             "run": run.name,
             "study": study.study,

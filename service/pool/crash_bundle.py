@@ -69,7 +69,7 @@ def write(
 def read(path: Path) -> Bundle:
     """A bundle from its .json file; the .npz lies beside it. RunError when either cannot be used."""
     try:
-        record = json.loads(path.read_text())
+        record = durable.parsed(path.read_text())
         with np.load(path.with_suffix(".npz"), allow_pickle=False) as arrays:
             layers = tuple(
                 (arrays[f"layer_{number}_weight"], arrays[f"layer_{number}_bias"]) for number in range(len(arrays) // 2)

@@ -21,6 +21,7 @@ from typing_extensions import TypedDict  # pydantic cannot check those of `typin
 from t6gps.service.pool import messages, scaling
 from t6gps.service.pool.messages import Instruction, Observation
 from t6gps.service.pool.state import Ending, PoolState, RunState
+from t6gps.storage import durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError
 
@@ -232,7 +233,7 @@ def _kept(folder: Path) -> list[Event]:
     for path, content in reversed(newest_first):
         for number, line in enumerate(content.splitlines(keepends=True), 1):
             try:
-                event: Event = json.loads(line)
+                event: Event = durable.parsed(line)
                 if not events or event["number"] > events[-1]["number"]:
                     events.append(event)
             except (ValueError, TypeError, KeyError) as error:
@@ -256,5 +257,5 @@ def _last_number(folder: Path) -> int:
     for path in (folder / FILE, folder / OLDER):
         for line in reversed(path.read_bytes().splitlines() if path.exists() else []):
             with suppress(ValueError, TypeError, KeyError):
-                return int(json.loads(line)["number"])
+                return int(durable.parsed(line)["number"])
     return -1

@@ -49,7 +49,7 @@ class Request:
 def read(run: Run) -> Request | None:
     """The last request since the run's process began, None when there is none. RunError when it cannot be read."""
     try:
-        fields = json.loads(run.request.read_text(encoding="utf-8"))
+        fields = durable.parsed(run.request.read_text(encoding="utf-8"))
         return Request(fields["id"], What(fields["what"]), fields["workers"])
     except FileNotFoundError:
         return None

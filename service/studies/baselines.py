@@ -86,7 +86,7 @@ def _keep_gait(run: Run, parameters: Array) -> None:
 
 
 def _kept_gait(run: Run) -> Array:
-    return np.array(json.loads((run.path / "gait.json").read_text()))
+    return np.array(durable.parsed((run.path / "gait.json").read_text()))
 
 
 def evolve(config: Config, steps: int, progress: Progress) -> Array:

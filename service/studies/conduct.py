@@ -17,7 +17,6 @@ from t6gps.service.config import Config
 from t6gps.service.provenance import commit
 from t6gps.service.studies import baselines, libraries
 from t6gps.service.studies.declared import BY_HAND, PAPER, PAPER_SEEDS, Arm, Baseline, Rival, Scale, Study
-from t6gps.service.studies.origin import Origin, origin, recorded
 from t6gps.service.studies.rivals import arms as rivals
 from t6gps.service.studies.rivals import curve
 from t6gps.service.studies.rivals.curve import Point
@@ -25,6 +24,7 @@ from t6gps.service.studies.watcher import Watcher
 from t6gps.service.training import evaluation, publishing, session
 from t6gps.service.training import origin as run_origin
 from t6gps.service.training.evaluation import Evaluation
+from t6gps.service.training.study_origin import Origin, origin, recorded
 from t6gps.service.views import run_figures
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run

@@ -39,7 +39,7 @@ def _fetched(run: Run, source: ObjectPath, root: Path, name: str, progress: Prog
         publishing.fetch(source, draft.path, progress)
         for folder in (draft.tables, draft.spool, draft.checkpoints, draft.figures):
             folder.mkdir(exist_ok=True)
-        faults = verification.verify(draft)
+        faults = verification.unsound(draft)
         if faults:
             raise RunError(
                 f"run {run.name} does not come whole from {source}: {faults[0]}; where it is being published, copy it "

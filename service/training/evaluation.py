@@ -19,6 +19,7 @@ from t6gps.storage.errors import RunError
 from t6gps.storage.records import Episode, PolicySnapshot
 from t6gps.workers.locomotion.measures import Measures, measures
 
+FILE = "evaluation.json"
 RECORDED = {
     "forward_speed_m_per_s": "forward_speed_m_per_s",
     "stuck_share_by_distance": "stuck_share_by_distance",
@@ -84,7 +85,7 @@ class Evaluation:
     @classmethod
     def from_json(cls, text: str) -> Evaluation:
         """The evaluation that `to_json` wrote; an older run may lack a quantity, or name it `stuck_share`."""
-        stored = json.loads(text)
+        stored = durable.parsed(text)
         if "stuck_share" in stored:
             stored["stuck_share_by_speed"] = stored.pop("stuck_share")
         estimates = {name: Estimate(**stored[name]) for name in EVALUATED if name in stored}
@@ -150,7 +151,7 @@ def kept(run: Run, condition: str | None = None) -> Evaluation | None:
         return None
     try:
         return Evaluation.from_json(path.read_text(encoding="utf-8"))
-    except (OSError, ValueError, KeyError, TypeError) as error:
+    except (OSError, ValueError, LookupError, TypeError, AttributeError) as error:
         raise RunError(
             f"run {run.name} is not whole: {path} cannot be read: {error!r}; restore it from a copy, or remove it and "
             "resume the run"
@@ -158,4 +159,4 @@ def kept(run: Run, condition: str | None = None) -> Evaluation | None:
 
 
 def _path(run: Run, condition: str | None) -> Path:
-    return run.path / "evaluation.json" if condition is None else run.path / "conditions" / f"{condition}.json"
+    return run.path / FILE if condition is None else run.path / "conditions" / f"{condition}.json"

@@ -7,16 +7,16 @@ Runs of earlier versions have neither: their ground is the file itself.
 
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
+from datetime import datetime
 from pathlib import Path
 
-from pydantic import BaseModel, ConfigDict, ValidationError
+from pydantic import BaseModel, ConfigDict, ValidationError, field_validator
 
 from t6gps.service import config as configuration
 from t6gps.service import provenance
 from t6gps.service.config import Config
-from t6gps.storage import catalog
+from t6gps.storage import catalog, durable
 from t6gps.storage.catalog import Run
 from t6gps.storage.errors import RunError, TerrainError
 from t6gps.storage.objects import place
@@ -52,6 +52,12 @@ class Origin(BaseModel):
     processor: str | None = None
     blas: str | None = None
     ground: Ground | None = None
+
+    @field_validator("date")
+    @classmethod
+    def _is_a_date(cls, date: str) -> str:
+        datetime.fromisoformat(date)
+        return date
 
 
 def create(config: Config, root: Path, name: str, numbered: bool = False) -> Run:
@@ -95,7 +101,7 @@ def kept(run: Run) -> Origin | None:
     if not path.exists():
         return None
     try:
-        record = json.loads(path.read_bytes())
+        record = durable.parsed(path.read_bytes())
         if "study" in record:  # earlier versions kept a run's place in its study there
             return None
         return Origin.model_validate(record)

@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-import json
-from collections.abc import Iterable
+from collections.abc import Iterable, Mapping
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
@@ -11,6 +10,7 @@ from typing import Any
 import pyarrow as pa
 import pyarrow.parquet as pq
 
+from t6gps.storage import durable
 from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import checkpoints, log
@@ -37,11 +37,13 @@ class Commits:
     """What the log of a table says.
 
     sums      SHA-256 of files by their names; commits of earlier versions have none
+    lacking   what commits have not of files, by their names, and those of this version have
     newest    the checkpoint that its readers begin with, None where there is none
     faults    what is wrong
     """
 
     sums: dict[str, str] = field(default_factory=dict)
+    lacking: dict[str, str] = field(default_factory=dict)
     newest: Path | None = None
     faults: list[Fault] = field(default_factory=list)
 
@@ -51,12 +53,13 @@ def read(run: Run, table: str) -> Commits:
     folder = run.tables / table / "_delta_log"
     repeated = {checkpoints.version(path): path for path in checkpoints.kept(folder)}
     found, state = Commits(newest=repeated[max(repeated)] if repeated else None), _State()
-    there = {int(path.stem): path for path in folder.glob("*.json") if path.stem.isdecimal()}
+    there = {int(path.stem): path for path in checkpoints.commits(folder)}
     for version in range(max([*there, *repeated], default=-1) + 1):
         path = there.get(version, folder / f"{version:020d}.json")
         try:
             actions = _actions(path)
             found.sums |= _sums(actions)
+            found.lacking |= _lacking(actions, found.sums)
             _replay(state, actions)
         except (OSError, ValueError, TypeError, LookupError, AttributeError) as error:
             what = "the commit is missing" if version not in there else f"the commit cannot be read: {error!r}"
@@ -69,7 +72,7 @@ def read(run: Run, table: str) -> Commits:
 def _actions(commit: Path) -> list[_Action]:
     """The actions of a commit by their kinds; some error for one that is damaged."""
     content = commit.read_text(encoding="utf-8")
-    actions = [action for line in content.splitlines() for action in json.loads(line).items()]
+    actions = [action for line in content.splitlines() for action in durable.parsed(line).items()]
     if not actions:
         raise ValueError("it is empty")
     return actions
@@ -78,6 +81,20 @@ def _actions(commit: Path) -> list[_Action]:
 def _sums(actions: Iterable[_Action]) -> dict[str, str]:
     digest = next((values.get(log.SHA256) for kind, values in actions if kind == "commitInfo"), None)
     return {values["path"]: digest for kind, values in actions if kind == "add" and digest is not None}
+
+
+def _lacking(actions: Iterable[_Action], sums: Mapping[str, str]) -> dict[str, str]:
+    """What the commit of a file has not; ValueError for one that leaves out rows, as no version does."""
+    lacking = dict[str, str]()
+    for add in (values for kind, values in actions if kind == "add"):
+        if add.get("deletionVector") is not None:
+            raise ValueError(f"it leaves out rows of {add['path']}")
+        stats = durable.parsed(add.get("stats") or "null")
+        if not isinstance(stats, dict) or not isinstance(stats.get("numRecords"), int):
+            lacking[add["path"]] = "number of rows"
+        if add["path"] not in sums:
+            lacking[add["path"]] = "SHA-256"
+    return lacking
 
 
 def _replay(state: _State, actions: Iterable[_Action]) -> None:

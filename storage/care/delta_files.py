@@ -36,6 +36,8 @@ KEYS = {
     "evaluation_frames": ("evaluation_id", "episode_id", "step", "policy_version"),
 }
 """Columns by which tables refer to each other."""
+SUMMED_SINCE = 7
+"""The version of the tables since which each commit has the SHA-256 of its file and the number of its rows."""
 _NUMBER = re.compile(r"(?:iteration|evaluation)-(\d{6})\.parquet")
 
 
@@ -43,7 +45,8 @@ _NUMBER = re.compile(r"(?:iteration|evaluation)-(\d{6})\.parquet")
 class Entry:
     """A file of a table: what the commit in its log says of it. Commits of earlier versions have no SHA-256.
 
-    ranges   least and largest entry of columns, by which readers skip files
+    ranges    least and largest entry of columns, by which readers skip files
+    lacking   what the commit has not, and one of this version has
     """
 
     path: Path
@@ -51,6 +54,7 @@ class Entry:
     rows_n: int | None
     sha256: str | None
     ranges: dict[str, tuple[int, int]]
+    lacking: str | None = None
 
     @property
     def number(self) -> int | None:
@@ -98,21 +102,23 @@ def opened(run: Run, table: str) -> Found:
         wrong = str(error)
     else:
         found.committed_n = log.committed(delta)
-        found.files = [_entry(run, table, row, written.sums) for row in actions]
+        found.files = [_entry(run, table, row, written) for row in actions]
     if wrong is not None:
         where = within(run, written.newest or run.tables / table / "_delta_log")
         found.faults.append(Fault(table, where, wrong, repairable=True))
     return found
 
 
-def _entry(run: Run, table: str, action: Mapping[str, Any], sums: Mapping[str, str]) -> Entry:
+def _entry(run: Run, table: str, action: Mapping[str, Any], written: commits.Commits) -> Entry:
+    path = action["path"]
     ranges = {name: (action.get(f"min.{name}"), action.get(f"max.{name}")) for name in log.IDENTITIES}
     return Entry(
-        run.tables / table / action["path"],
+        run.tables / table / path,
         action["size_bytes"],
         action.get("num_records"),
-        sums.get(action["path"]),
+        written.sums.get(path),
         {name: (least, most) for name, (least, most) in ranges.items() if least is not None and most is not None},
+        written.lacking.get(path),
     )
 
 
@@ -124,10 +130,12 @@ def examine(run: Run, found: Found, entry: Entry) -> None:
     """
     try:
         sound = _as_written(entry)
-        keys = _keys(found.table, entry)
+        keys, version = _keys(found.table, entry)
         wrong = _contradicted(entry, keys)
         if wrong is not None and not sound:
             raise ValueError(wrong)
+        if entry.lacking is not None and version >= SUMMED_SINCE:
+            wrong = f"its log has no {entry.lacking}"
         kept = _by_episode(keys) if "frames" in found.table else keys
     except (pa.ArrowException, OSError, ValueError, LookupError, TypeError, DataError) as error:
         place.answers(entry.path, error)
@@ -136,7 +144,7 @@ def examine(run: Run, found: Found, entry: Entry) -> None:
     else:
         if wrong is not None:
             log_of = f"tables/{found.table}/_delta_log"
-            what = f"of {entry.path.name} {wrong.removeprefix('its log ')}, and the file has its SHA-256"
+            what = f"of {entry.path.name} {wrong.removeprefix('its log ')}, and the file is whole by itself"
             found.faults.append(Fault(found.table, log_of, what, entry.number, repairable=True))
         found.keys[entry.path.name] = kept
 
@@ -174,8 +182,8 @@ def _contradicted(entry: Entry, keys: pa.Table) -> str | None:
     return None
 
 
-def _keys(table: str, entry: Entry) -> pa.Table:
-    """The keys of a file that is whole by itself, else some error."""
+def _keys(table: str, entry: Entry) -> tuple[pa.Table, int]:
+    """The keys of a file that is whole by itself, and its schema version; else some error."""
     with pq.ParquetFile(place.source(entry.path), page_checksum_verification=True) as file:
         wrong = parquet.differs(table, file.schema_arrow)
         if wrong is not None:
@@ -187,7 +195,8 @@ def _keys(table: str, entry: Entry) -> pa.Table:
                 for row in rows.to_pylist():
                     policies.policy(row)  # against its SHA-256
             groups.append(rows.select(KEYS[table]))
-    return pa.concat_tables(group.replace_schema_metadata(None).cast(_bare(table)) for group in groups)
+        version = parquet.version_of(file.schema_arrow)
+    return pa.concat_tables(group.replace_schema_metadata(None).cast(_bare(table)) for group in groups), version
 
 
 def _bare(table: str) -> pa.Schema:

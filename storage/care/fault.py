@@ -16,7 +16,7 @@ Progress = Callable[[int, int], object]
 class Fault:
     """Something of a run that is not as it was written.
 
-    part         a table, or checkpoints, spool, config, origin, ground, evaluation
+    part         a table, or checkpoints, spool, config, origin, study, ground, evaluation
     place        its file or folder, by its path in the run
     what         what is wrong with it
     number       the iteration, or of tables of evaluations the evaluation, that it belongs to; None where to none

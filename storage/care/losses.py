@@ -6,11 +6,10 @@ others again, to the same bytes. Evaluations are kept up to the first that is da
 
 from __future__ import annotations
 
-import json
 from collections.abc import Iterable, Mapping
 from pathlib import Path
 
-from t6gps.storage import checkpoint, schema
+from t6gps.storage import checkpoint, durable, schema, spool
 from t6gps.storage.care import delta_files
 from t6gps.storage.care.fault import Fault, within
 from t6gps.storage.care.mending import DAMAGED, set_aside
@@ -23,6 +22,7 @@ APART = ("spool", "checkpoints", "evaluation")
 
 def without(draft: Run, faults: Iterable[Fault]) -> list[str]:
     """Set aside what is damaged; what is lost, and how it comes again."""
+    draft.tables.mkdir(exist_ok=True)
     apart = [fault for fault in faults if fault.part in APART]
     for fault in apart:
         set_aside(draft, fault.place)
@@ -39,8 +39,7 @@ def _again(draft: Run, fault: Fault) -> str:
             return "there is no other one, so that a run that is resumed begins anew, to the same bytes"
         return f"{within(draft, states[max(states)])} serves when the run is resumed"
     if fault.part == "spool":
-        iteration = int(Path(fault.place).parent.name.removeprefix("iteration-"))
-        if iteration < max(states, default=0):
+        if spool.iteration_of(Path(fault.place)) < max(states, default=0):
             return "its iteration is finished, and nothing needs it"
         return "its episode is sampled again when the run is resumed"
     if fault.place.startswith("conditions/"):
@@ -89,12 +88,12 @@ def _cut(draft: Run, table: str, first: int) -> None:
     folder = draft.tables / table
     for state in checkpoints.kept(folder / "_delta_log"):
         set_aside(draft, within(draft, state))
-    entries = sorted((folder / "_delta_log").glob("*.json"))
+    entries = checkpoints.commits(folder / "_delta_log")
     numbers = [_number(entry) for entry in entries]
     end = next((k for k, number in enumerate(numbers) if number is None or number >= first), len(entries))
     for commit in reversed(entries[end:]):  # with those that add no file: a log has no gaps
         set_aside(draft, within(draft, commit))
-    if not any((folder / "_delta_log").glob("*.json")):
+    if not checkpoints.commits(folder / "_delta_log"):
         set_aside(draft, f"tables/{table}/_delta_log")
     for path in sorted(folder.glob("*.parquet")):
         number = delta_files.number_of(path.name)
@@ -105,7 +104,7 @@ def _cut(draft: Run, table: str, first: int) -> None:
 def _number(commit: Path) -> int | None:
     """The number of the file that a commit adds; -1 for one that adds none, None where it cannot be read."""
     try:
-        actions = [json.loads(line) for line in commit.read_text(encoding="utf-8").splitlines()]
+        actions = [durable.parsed(line) for line in commit.read_text(encoding="utf-8").splitlines()]
         return max((int(action["txn"]["version"]) for action in actions if "txn" in action), default=-1)
     except (OSError, ValueError, TypeError, LookupError):
         return None

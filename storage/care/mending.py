@@ -21,16 +21,25 @@ from t6gps.storage.errors import DataError, RunError
 DAMAGED = "damaged"
 
 
-def set_aside(draft: Run, place: str) -> None:
-    """Move a file or folder to where damaged ones are kept, under its name or a number that is free."""
+def set_aside(draft: Run, place: str, ending: str = "") -> None:
+    """Move a file or folder to where damaged ones are kept, under its name with an ending, or a number that is free."""
     path, number = draft.path / place, 1
-    target = kept = draft.path / DAMAGED / place
+    target = kept = draft.path / DAMAGED / f"{place}{ending}"
     while target.exists():
         number += 1
         target = kept.with_name(f"{kept.name}.{number}")
     if path.exists():
         target.parent.mkdir(parents=True, exist_ok=True)
         path.rename(target)
+
+
+def without_obstacles(draft: Run) -> list[str]:
+    """Set aside files that lie where the folders of tables belong; what was done."""
+    tables = (f"tables/{table}{log_of}" for log_of in ("", "/_delta_log") for table in schema.TABLES)
+    files = [place for place in ("tables", *tables) if (draft.path / place).is_file()]
+    for place in files:
+        set_aside(draft, place, ".file")  # so that what belongs there can be set aside, too
+    return [f"{place} is set aside in {DAMAGED}/: it is no folder" for place in files]
 
 
 def without_checkpoints(draft: Run, faults: Iterable[Fault]) -> dict[str, str]:
@@ -67,11 +76,12 @@ def from_copy(draft: Run, copy: Run, faults: Iterable[Fault], unsound: Iterable[
     """
     _check_same(draft, copy, {fault.part for fault in faults})
     spoilt = {fault.place for fault in unsound}
-    sentences = []
+    sentences, taken = list[str](), list[str]()
     for place in sorted({fault.place for fault in faults}):
         source = copy.path / place
-        if place in spoilt or not source.exists():
+        if place in spoilt or not source.exists() or any(place.startswith(f"{whole}/") for whole in taken):
             continue
+        taken.append(place)
         if place.endswith("_delta_log"):
             if _has_less(copy, draft, place):
                 continue  # the log is built anew from the files

@@ -6,6 +6,7 @@ get their places leaves each file old or new; repairing again ends it.
 
 from __future__ import annotations
 
+import errno
 import shutil
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
@@ -19,6 +20,12 @@ from t6gps.storage.care.fault import Fault
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet
 from t6gps.storage.errors import RunError
+
+REMEDIES = {
+    **dict.fromkeys((errno.ENOSPC, errno.EDQUOT, errno.EFBIG), "make room beside it"),
+    **dict.fromkeys((errno.EACCES, errno.EPERM, errno.EROFS), "get permission to write in it and beside it"),
+}
+"""What helps against an error of the system."""
 
 
 @dataclass(frozen=True)
@@ -47,9 +54,8 @@ def repair(run: Run, copy: Run | None, verify: Callable[[Run], list[Fault]]) -> 
                 durable.sync_tree(folder)
                 _put_in_place(folder, run.path)
         except OSError as error:
-            raise RunError(
-                f"cannot repair run {run.name}: {error}; make room beside it, with leave to write"
-            ) from error
+            remedy = REMEDIES.get(error.errno or 0, "mend that, and repair again")
+            raise RunError(f"cannot repair run {run.name}: {error}; nothing is lost; {remedy}") from error
         return Repaired(sentences, verify(run))
 
 
@@ -69,10 +75,11 @@ def _mended(
 ) -> list[str]:
     hidden = shutil.ignore_patterns(".*")
     shutil.copytree(run.path, draft.path, dirs_exist_ok=True, copy_function=durable.link, ignore=hidden)
+    sentences = mending.without_obstacles(draft)
     wrong = mending.without_checkpoints(draft, faults)
-    if wrong:
+    if wrong or sentences:
         faults = verify(draft)
-    sentences = mending.told(wrong, faults)
+    sentences += mending.told(wrong, faults)
     if copy is not None:
         unsound = verify(copy)
         for take in (mending.from_copy, mending.tables_from_copy):
@@ -91,16 +98,29 @@ def _put_in_place(draft: Path, run: Path) -> None:
     wanted, there = (set(_files(folder)) for folder in (draft, run))
     for place in sorted(wanted, key=lambda place: (place.parts[0] != mending.DAMAGED, place)):
         if place not in there or not (draft / place).samefile(run / place):
-            (run / place).parent.mkdir(parents=True, exist_ok=True)
+            _make_way(run / place, run)
             (draft / place).replace(run / place)
     for place in sorted(there - wanted, reverse=True):
-        (run / place).unlink()
+        if not (run / place).is_dir():  # which it has become by now
+            (run / place).unlink(missing_ok=True)
+    for folder in (path for path in sorted(draft.rglob("*")) if path.is_dir()):
+        (run / folder.relative_to(draft)).mkdir(exist_ok=True)
     for folder in sorted((path for path in run.rglob("*") if path.is_dir()), reverse=True):
         if not any(folder.iterdir()) and not (draft / folder.relative_to(run)).exists():
             folder.rmdir()
         else:
             durable.sync(folder)
     durable.sync(run)
+
+
+def _make_way(path: Path, run: Path) -> None:
+    """Let a file have its place, where a file is instead of a folder, or the reverse; both are set aside by now."""
+    for folder in reversed(path.relative_to(run).parents):
+        if (run / folder).is_file():
+            (run / folder).unlink()
+        (run / folder).mkdir(exist_ok=True)
+    if path.is_dir():
+        shutil.rmtree(path)
 
 
 def _files(folder: Path) -> Iterator[Path]:

@@ -28,16 +28,18 @@ def verify(run: Run, progress: Progress = lambda done, total: None) -> list[Faul
     """What is wrong with a run's tables, checkpoints and spool; a file is read a row group at a time."""
     states = checkpoint.kept(run.checkpoints)  # each is written after the tables
     names = (*FIRST, *(name for name in schema.TABLES if name not in FIRST + LAST), *LAST)
-    tables = {name: delta_files.opened(run, name) for name in names}
+    there = run.tables.is_dir() or place.is_object(run.path)
+    tables = {name: delta_files.opened(run, name) if there else Found(name) for name in names}
     iterations_n = tables["episodes"].committed_n
-    waiting = sorted(run.spool.glob("iteration-*/episode-*.arrow"))
+    waiting = spool.files(run.spool)
     work = [(found, entry) for found in tables.values() for entry in found.files]
     total = len(work) + len(states) + len(waiting)
     for done, (found, entry) in enumerate(work):
         progress(done, total)
         delta_files.examine(run, found, entry)
     complete = _complete(run, tables, iterations_n)
-    faults = [*(fault for found in tables.values() for fault in found.faults)]
+    faults = [] if there else [Fault("episodes", run.tables.name, "it is no folder", repairable=True)]
+    faults += (fault for found in tables.values() for fault in found.faults)
     faults += references.faults(tables, iterations_n, complete)
     progress(len(work), total)
     faults += _checkpoints(run, states, iterations_n)
@@ -102,7 +104,7 @@ def _checkpoints(run: Run, states: dict[int, Path], iterations_n: int) -> Iterat
 def _spooled(run: Run, waiting: list[Path]) -> Iterator[Fault]:
     for path in waiting:
         try:
-            spool.checked(spool.read(path), int(path.parent.name.removeprefix("iteration-")))
+            spool.checked(spool.read(path), spool.iteration_of(path))
         except (pa.ArrowException, OSError, DataError) as error:
             place.answers(path, error)
             if path.exists():

@@ -26,6 +26,11 @@ def kept(log: Path) -> list[Path]:
     return sorted(log.glob(f"{'[0-9]' * DIGITS_N}{ENDING}"))
 
 
+def commits(log: Path) -> list[Path]:
+    """The commits of a log, oldest first. Whatever else lies there is none, such as a copy of one."""
+    return sorted(log.glob(f"{'[0-9]' * DIGITS_N}.json"))
+
+
 def version(path: Path) -> int:
     """The number of the commit with which a checkpoint ends."""
     return int(path.name.removesuffix(ENDING))

@@ -10,11 +10,12 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 
 import pyarrow as pa
 
-from t6gps.storage import fields, schema
+from t6gps.storage import checkpoint, fields, schema
 from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log, parquet, policies
 from t6gps.storage.delta.parquet import Files
-from t6gps.storage.errors import DataError, RunError
+from t6gps.storage.errors import CheckpointError, DataError, RunError
+from t6gps.storage.objects import place
 from t6gps.storage.records import Episode, Learned
 
 STEM = "iteration"
@@ -71,17 +72,36 @@ def row_groups(episodes: Iterable[Episode], where: str, summaries: list[pa.Table
 
 def committed(run: Run) -> int:
     """How many iterations are committed: 0 .. n - 1. DataError where the table that says so is damaged or missing."""
+    with log.readable(run, "episodes"):
+        there = place.is_object(run.path) or run.tables.is_dir()  # in an object store a folder comes with its files
+    if not there:
+        raise log.damaged(run, "episodes", f"{run.tables} is no folder")
     episodes = log.opened(run, "episodes")
     if episodes is not None:
         return log.committed(episodes)
     others = {name: log.committed(log.opened(run, name)) for name in schema.OF_ITERATIONS}
     name = max(others, key=others.__getitem__)
-    if others[name] <= 1:
+    finished_n = finished(run)
+    if others[name] <= 1 and not finished_n:
         return 0
     episodes = log.opened(run, "episodes")  # once more: iterations may have been committed meanwhile
     if episodes is None:
-        raise log.damaged(run, "episodes", f"it is missing, and {name} has {others[name]} iterations")
+        of = f"{name} has {others[name]} iterations" if others[name] > 1 else f"a checkpoint has {finished_n}"
+        raise log.damaged(run, "episodes", f"it is missing, and {of}")
     return log.committed(episodes)
+
+
+def finished(run: Run) -> int:
+    """The iterations that the newest sound checkpoint of a learner follows; 0 without one.
+
+    The states of baselines are not of iterations, and lack a ledger.
+    """
+    for iteration, path in sorted(checkpoint.kept(run.checkpoints).items(), reverse=True):
+        try:
+            return iteration if "ledger" in checkpoint.manifest(path) else 0
+        except CheckpointError:  # it is torn, of which verifying tells, or has gone meanwhile
+            continue
+    return 0
 
 
 def files(run: Run, table: str, iterations_n: int) -> Files:

@@ -152,7 +152,7 @@ def _commit(run: Run, table: str, delta: DeltaTable | None, file: Path, number: 
             post_commithook_properties=_NO_HOOKS,
         )
     log = folder / "_delta_log"
-    entries = sorted(log.glob("*.json"))
+    entries = checkpoints.commits(log)
     for entry in entries[-2:]:  # the commit, and what may come with it: the table's creation, or new columns
         durable.sync(entry)
     for parent in (log, folder, run.tables):

@@ -11,7 +11,6 @@ What is left to copy follows from both logs. A copy that was cut off is continue
 from __future__ import annotations
 
 import hashlib
-import json
 import mmap
 import secrets
 import sys
@@ -220,7 +219,7 @@ def _said(entry: Path) -> tuple[int | None, list[str]]:
     RunError where it is torn.
     """
     try:
-        actions = [json.loads(line) for line in entry.read_text(encoding="utf-8").splitlines()]
+        actions = [durable.parsed(line) for line in entry.read_text(encoding="utf-8").splitlines()]
         number = next((int(action["txn"]["version"]) for action in actions if "txn" in action), None)
         return number, [str(action["add"]["path"]) for action in actions if "add" in action]
     except (ValueError, LookupError, TypeError) as error:

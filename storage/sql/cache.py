@@ -30,7 +30,7 @@ TABLES = ("episodes", "iterations")
 
 _log = logging.getLogger(__name__)
 _INDEX = "index.json"
-_FORMAT_VERSION = 1
+_FORMAT_VERSION = 2
 _CLOCK_STEP_NS = 2 * 10**9
 """Two changes of a file within less may have the same time, on the coarsest of file systems."""
 
@@ -113,7 +113,7 @@ def _kept(run: Run) -> Whole | None:
         return None
     entry = run.cache / state.key
     try:
-        index = json.loads((entry / _INDEX).read_bytes())
+        index = durable.parsed((entry / _INDEX).read_bytes())
     except (OSError, ValueError):
         return None
     files = {
@@ -133,6 +133,8 @@ def _entered(run: Run) -> Whole | None:
             if state is None or not settled or state.device != now.st_dev:
                 return None
             found = _read(run)
+            if not found.done:  # a run whose tables are lost looks as it did then
+                return found
             _write(run, draft, found)
             entries = sorted(run.cache.glob("[!.]*"), key=lambda entry: entry.stat().st_mtime)
             for entry in entries[:-1]:  # whoever asked a moment ago may yet read the last one

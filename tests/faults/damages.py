@@ -17,6 +17,9 @@ from t6gps.storage.catalog import Run
 from t6gps.storage.delta import log
 from t6gps.storage.spool import Spool
 
+DEEP = "[" * 100_000
+"""More brackets than a reader's stack holds."""
+
 
 def flip(file: Path, place: int) -> None:
     """Change one bit of a file."""
@@ -48,6 +51,12 @@ def with_column(rows: pa.Table, name: str, value: object) -> pa.Table:
     return rows.set_column(place, rows.schema.field(name), pa.array(values, rows.schema.field(name).type))
 
 
+def as_file(folder: Path) -> None:
+    """Leave a file where a folder was."""
+    shutil.rmtree(folder)
+    folder.write_text("lost")
+
+
 def commit_of(table: str, number: int) -> str:
     return f"tables/{table}/_delta_log/{number:020d}.json"
 
@@ -62,6 +71,15 @@ def alter(run: Run, table: str, number: int, change: Callable[[dict[str, Any]], 
     commit.write_text("\n".join(map(json.dumps, actions)))
 
 
+def unsaid(run: Run) -> None:
+    """Take from a commit the SHA-256 of its file."""
+    commit = run.path / commit_of("models", 2)
+    actions = [json.loads(line) for line in commit.read_text().splitlines()]
+    for action in actions:
+        action.get("commitInfo", {}).pop(log.SHA256, None)
+    commit.write_text("\n".join(map(json.dumps, actions)))
+
+
 def _stats(add: dict[str, Any], **changed: object) -> None:
     add["stats"] = json.dumps(json.loads(add["stats"]) | changed)
 
@@ -70,6 +88,11 @@ ALTERED: dict[str, Callable[[dict[str, Any]], object]] = {
     "size": lambda add: add.update(size=add["size"] + 1),
     "rows": lambda add: _stats(add, numRecords=7),
     "range": lambda add: _stats(add, minValues={"iteration": 0}, maxValues={"iteration": 9}),
+    "statistics that are none": lambda add: add.update(stats="[1]"),
+    "statistics that are null": lambda add: add.update(stats=None),
+    "rows left out": lambda add: add.update(
+        deletionVector={"storageType": "u", "pathOrInlineDv": "x", "sizeInBytes": 1, "cardinality": 1}
+    ),
 }
 """What may be wrong in a commit whose file is as it was."""
 DAMAGES: dict[str, tuple[str, Callable[[Run], object]]] = {
@@ -83,6 +106,13 @@ DAMAGES: dict[str, tuple[str, Callable[[Run], object]]] = {
         f"a commit's {name}": ("frames", lambda run, change=change: alter(run, "frames", 1, change))
         for name, change in ALTERED.items()
     },
+    "no digest in a commit": ("models", unsaid),
+    "a commit of brackets": ("models", lambda run: (run.path / commit_of("models", 2)).write_text(DEEP)),
+    "no tables": ("episodes", lambda run: shutil.rmtree(run.tables)),
+    "empty tables": ("episodes", lambda run: [shutil.rmtree(table) for table in run.tables.iterdir()]),
+    "a file named tables": ("episodes", lambda run: as_file(run.tables)),
+    "a file named as a table": ("models", lambda run: as_file(run.tables / "models")),
+    "a file named as a log": ("models", lambda run: as_file(run.tables / "models" / "_delta_log")),
     "end of a log": ("classes", lambda run: (run.path / commit_of("classes", 3)).unlink()),
     "end of the last log": ("episodes", lambda run: (run.path / commit_of("episodes", 3)).unlink()),
     "no table": ("evaluation_frames", lambda run: shutil.rmtree(run.tables / "evaluation_frames")),

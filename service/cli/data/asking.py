@@ -57,7 +57,7 @@ def query(
 ) -> None:
     """Query the stored trajectories of a run, or of many, with SQL."""
     written = None if out is None else _form(out, form)
-    text, parameters = _sql(sql, file), dict(_parameter(param) for param in params or [])
+    text, parameters = _sql(sql, file), _parameters(params or [])
     with door.opened(root, server) as there:
         if out is not None and written is not None:
             with _whole_file(out) as sink:
@@ -74,11 +74,23 @@ def _sql(sql: str | None, file: Path | None) -> str:
     if (sql is None) == (file is None):
         raise ConfigError("query takes either SQL or --file; - in the place of SQL reads it from the standard input")
     try:
-        return sys.stdin.read() if sql == "-" else sql or Path(file or "").read_text(encoding="utf-8-sig")
+        if sql is None:
+            return Path(file or "").read_text(encoding="utf-8-sig")
+        return sys.stdin.read() if sql == "-" else sql
     except OSError as error:
         raise ConfigError(f"cannot read SQL from {file}: {error.strerror}; name an existing file") from None
     except UnicodeDecodeError as error:
         raise ConfigError(f"SQL from {file or 'the standard input'} is not UTF-8: {error}; save it as UTF-8") from None
+
+
+def _parameters(params: list[str]) -> dict[str, Parameter]:
+    """The values of $names. ConfigError where one of them has two."""
+    found = dict[str, Parameter]()
+    for name, value in map(_parameter, params):
+        if name in found:
+            raise ConfigError(f"--param {name} is given twice: {found[name]!r}, then {value!r}; give it one value")
+        found[name] = value
+    return found
 
 
 def _parameter(param: str) -> tuple[str, Parameter]:

@@ -15,7 +15,9 @@ from t6gps.service.training import copying, verification
 from t6gps.service.views import terminal
 from t6gps.storage import catalog
 from t6gps.storage.care import repair as repairing
-from t6gps.storage.errors import RunError
+from t6gps.storage.care.fault import Fault, Progress
+from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError, StoreError, T6GpsError
 
 EXIT_DAMAGED = 2
 NewName = Annotated[str, typer.Argument(metavar="NEW", help="Name that it gets.")]
@@ -52,7 +54,7 @@ def verify(
     found = {}
     for run in runs:
         with terminal.task(f"verifying {run.name}") as progress:
-            found[run.name] = verification.verify(run, progress)
+            found[run.name] = _faults(run, progress)
         if not as_json:
             faults = found[run.name]
             typer.echo("\n".join(f"{run.name}: {fault}" for fault in faults) if faults else f"{run.name}: sound")
@@ -60,6 +62,16 @@ def verify(
         typer.echo(json.dumps({"runs": {name: [asdict(fault) for fault in faults] for name, faults in found.items()}}))
     if any(found.values()):
         raise typer.Exit(EXIT_DAMAGED)
+
+
+def _faults(run: Run, progress: Progress) -> list[Fault]:
+    """The faults of a run; what keeps it from being read hides no other run. StoreError as for all runs."""
+    try:
+        return verification.verify(run, progress)
+    except StoreError:
+        raise
+    except (T6GpsError, OSError) as error:
+        return [Fault("run", ".", f"it cannot be read: {error}")]
 
 
 def repair(

@@ -76,6 +76,8 @@ def test_sql_comes_from_the_standard_input(root: Path) -> None:
         (["rough-0", "SELEC 1", "--out", "x.csv"], ["SELEC"]),
         (["rough-0", "SELECT $a", "--param", "a"], ["NAME=VALUE", "'a'"]),
         (["rough-0", "SELECT $a", "--param", "a={b=1}"], ["--param a takes a number"]),
+        (["rough-0", "SELECT $a", "--param", "a=1", "--param", "a=2"], ["--param a is given twice: 1, then 2"]),
+        (["rough-0", ""], ["SELECT"]),
         (["rough-0", "SELECT $a"], ["$a has no value"]),
         (["rouhg-*", "SELECT 1"], ["the closest: rough-"]),
         (["rough-broken", "SELECT run FROM runs"], ["run rough-broken is not whole"]),

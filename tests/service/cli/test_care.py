@@ -6,13 +6,15 @@ from pathlib import Path
 
 import pytest
 from command import t6gps
-from damages import flip
+from damages import DEEP, flip
 from tiny_run import Trained
 
 import t6gps as package
 from t6gps.service.training import verification
 from t6gps.storage import catalog
 from t6gps.storage.catalog import Run
+
+STUDY = json.dumps({"study": "grip", "arm": "low", "seed": 0, "commits": ["abc"], "wall_s": 1.5, "cores": 2})
 
 
 @pytest.fixture
@@ -39,16 +41,70 @@ def test_sound_runs_are_said_to_be_and_a_damaged_one_is_named_with_the_file(root
 
 @pytest.mark.parametrize(
     ("place", "part"),
-    [("config.json", "config"), ("origin.json", "origin"), ("evaluation.json", "evaluation")],
+    [
+        ("config.json", "config"),
+        ("origin.json", "origin"),
+        ("evaluation.json", "evaluation"),
+        ("study.json", "study"),
+    ],
 )
 def test_what_the_service_keeps_beside_the_tables_is_verified(root: Path, place: str, part: str) -> None:
     run = Run(root / "tiny")
+    (run.path / "study.json").write_text(STUDY)
     content = (run.path / place).read_text()
-    for damaged in (content[: len(content) // 2], content.replace("3", "4") if part == "evaluation" else ""):
+    for damaged in (
+        content[: len(content) // 2],
+        content.replace("3", "4") if part == "evaluation" else "",
+        "[1]",
+        DEEP,
+    ):
         (run.path / place).write_text(damaged)
         assert {fault.part for fault in verification.verify(run)} == {part}
     (run.path / place).write_text(content)
     assert verification.verify(run) == []
+
+
+def test_a_run_that_cannot_be_read_hides_no_other(root: Path) -> None:
+    for place in ("config.json", "origin.json", "evaluation.json"):
+        (root / "other" / place).write_text(DEEP)
+    done = t6gps("verify", "--root", root, code=2)
+    assert "tiny: sound" in done.stdout.decode() and "100 deep" in done.stdout.decode()
+
+
+def test_an_origin_without_a_date_is_a_fault(root: Path) -> None:
+    path = root / "tiny" / "origin.json"
+    path.write_text(json.dumps(json.loads(path.read_text()) | {"date": "yesterday"}))
+    assert [fault.part for fault in verification.verify(Run(root / "tiny"))] == ["origin"]
+
+
+@pytest.mark.parametrize(
+    ("lost", "part"),
+    [
+        ("checkpoints", "checkpoints"),
+        ("checkpoints/iteration-000003", "checkpoints"),
+        ("evaluation.json", "evaluation"),
+    ],
+)
+def test_what_a_finished_run_has_lost_is_seen_and_comes_from_a_copy(root: Path, lost: str, part: str) -> None:
+    run = Run(root / "tiny")
+    shutil.rmtree(run.path / lost) if (run.path / lost).is_dir() else (run.path / lost).unlink()
+    assert [fault.part for fault in verification.verify(run)] == [part]
+    refused = t6gps("repair", "tiny", "--root", root, code=2)
+    assert "resume the run" in refused.stdout.decode()
+    t6gps("repair", "tiny", "--from", root / "other", "--root", root)
+    assert verification.verify(run) == []
+
+
+def test_a_crash_before_a_checkpoint_and_what_a_repair_sets_aside_are_no_losses(root: Path) -> None:
+    run, other = Run(root / "tiny"), Run(root / "other")
+    shutil.rmtree(run.tables / "evaluations")
+    (run.path / "evaluation.json").unlink()
+    shutil.rmtree(run.checkpoints / "iteration-000003")
+    assert verification.verify(run) == []
+    for state in other.checkpoints.iterdir():
+        (state / "DONE").unlink()
+    t6gps("repair", "other", "--root", root)
+    assert verification.verify(other) == []
 
 
 def test_lost_evaluations_are_seen(root: Path) -> None:

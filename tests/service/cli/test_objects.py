@@ -10,7 +10,7 @@ import synthetic
 from command import t6gps as command
 
 import t6gps
-from t6gps.service.studies import origin as studies
+from t6gps.service.training import study_origin as studies
 from t6gps.storage.objects import publishing
 from t6gps.storage.objects.place import ObjectPath
 

@@ -13,6 +13,7 @@ import numpy as np
 import pytest
 import tiny_run
 from command import t6gps
+from damages import DEEP
 from tiny_run import Trained
 
 import t6gps as package
@@ -34,6 +35,9 @@ def ground_lost(run: Path) -> None:
 DAMAGES: dict[str, Callable[[Path], object]] = {
     "gap in a log": gap,
     "missing table": lambda run: shutil.rmtree(run / "tables" / "iterations"),
+    "missing tables": lambda run: shutil.rmtree(run / "tables"),
+    "empty tables": lambda run: [shutil.rmtree(table) for table in (run / "tables").iterdir()],
+    "a configuration of brackets": lambda run: (run / "config.json").write_text(DEEP),
     "unreadable configuration": lambda run: (run / "config.json").write_bytes(b"\xff\xfe{"),
     "missing configuration": lambda run: (run / "config.json").unlink(),
     "missing ground": ground_lost,
@@ -77,7 +81,13 @@ def test_a_damaged_run_is_one_clear_error_of_whoever_needs_what_is_damaged(
 ) -> None:
     spared = {
         "show": set[str](),
-        "query": {"unreadable configuration", "missing configuration", "missing ground", "missing table"},
+        "query": {
+            "unreadable configuration",
+            "missing configuration",
+            "missing ground",
+            "missing table",
+            "a configuration of brackets",
+        },
         "render": {"missing table"},
         "view": {"missing table"},
         "figures": set[str](),
@@ -90,6 +100,17 @@ def test_a_damaged_run_is_one_clear_error_of_whoever_needs_what_is_damaged(
     if damage in needed:
         assert done.stderr.startswith("error: ")
         assert str(root / "tiny") in done.stderr
+
+
+@pytest.mark.parametrize("damage", ["missing tables", "empty tables"])
+def test_lost_tables_are_no_run_that_has_just_begun(damage: str, root: Path) -> None:
+    run = catalog.open_run(root, "tiny")
+    assert len(package.open_run(root / "tiny").query("SELECT iteration FROM iterations")) == 3
+    DAMAGES[damage](run.path)
+    with pytest.raises(T6GpsError, match="is not whole"):
+        package.open_run(root / "tiny").query("SELECT iteration FROM iterations")
+    left_out = t6gps("query", "tin*", "SELECT count(*) FROM frames", "--root", root)
+    assert "left out: run tiny is not whole" in left_out.stderr
 
 
 GUARDED: list[Path] = []

@@ -19,8 +19,8 @@ from t6gps.service.execution.serial import new_learner
 from t6gps.service.studies import arm_figures, baselines, conduct, declared, ground_figures, report
 from t6gps.service.studies.conduct import Finished, Trial
 from t6gps.service.studies.declared import PAPER, STUDIES, Arm, Baseline, Scale, Study
-from t6gps.service.studies.origin import EARLIER_FILE, FILE, Origin, origin, recorded
 from t6gps.service.training import evaluation
+from t6gps.service.training.study_origin import EARLIER_FILE, FILE, Origin, origin, recorded
 from t6gps.storage import catalog, tables
 from t6gps.storage.errors import ConfigError, RunError
 from t6gps.storage.schema import OBSERVATION_N

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import os
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +14,7 @@ from t6gps.storage import catalog, checkpoint, schema, tables
 from t6gps.storage.care.repair import repair
 from t6gps.storage.care.verify import verify
 from t6gps.storage.catalog import Run
-from t6gps.storage.errors import RunError
+from t6gps.storage.errors import DataError, RunError
 from t6gps.storage.spool import Spool
 
 
@@ -46,6 +47,39 @@ def test_a_log_is_built_anew_from_its_files_and_the_old_one_kept(worked: Run) ->
     assert (done.left, verify(worked)) == ([], [])
     assert {name: tables.read(worked, name) for name in schema.TABLES} == rows
     assert (worked.path / "damaged" / torn.relative_to(worked.path)).stat().st_size == 60
+
+
+@pytest.mark.parametrize(
+    "damage", ["no tables", "empty tables", "a file named tables", "a file named as a table", "a file named as a log"]
+)
+def test_lost_tables_are_repaired_by_a_copy_and_else_made_anew(worked: Run, tmp_path: Path, damage: str) -> None:
+    copy, second = (catalog.copy(worked, tmp_path, name) for name in ("copy", "second"))
+    part, plant = DAMAGES[damage]
+    for run in (worked, second):
+        plant(run)
+        with pytest.raises(DataError, match=f"table {part} .*cannot be read"):
+            tables.read(run, "frames" if part == "episodes" else part)
+    assert repair(worked, copy, verify).left == []
+    assert {name: tables.read(worked, name) for name in schema.TABLES} == {
+        name: tables.read(copy, name) for name in schema.TABLES
+    }
+    done = repair(second, None, verify)
+    assert (done.left, verify(second)) == ([], [])
+    assert tables.committed_iterations(second) == (3 if "log" in damage else 0)
+
+
+def test_what_only_looks_like_a_part_of_a_run_is_none(worked: Run, make_episode: Any) -> None:
+    for folder in (worked.checkpoints, worked.spool):
+        for name in ("iteration-000010.bak", "iteration-abc", "iteration-000010 (copy)"):
+            (folder / name).mkdir()
+            (folder / name / "episode-000000000001.arrow").write_text("torn")
+    log = worked.tables / "frames" / "_delta_log"
+    shutil.copy(log / f"{1:020d}.json", log / f"{1:020d} (copy).json")
+    assert verify(worked) == []
+    os.truncate(worked.tables / "models" / "iteration-000001.parquet", 100)
+    assert repair(worked, None, verify).left == []
+    assert list(checkpoint.kept(worked.checkpoints)) == [1]
+    assert (worked.checkpoints / "iteration-abc").is_dir()
 
 
 @pytest.mark.parametrize("name", ALTERED)

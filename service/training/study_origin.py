@@ -9,8 +9,11 @@ from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 
+from pydantic import TypeAdapter
+
 from t6gps.storage import durable
 from t6gps.storage.catalog import Run
+from t6gps.storage.errors import RunError
 
 FILE = "study.json"
 EARLIER_FILE = "origin.json"
@@ -32,12 +35,23 @@ class Origin:
     cores: int | None = None
 
 
+_ORIGIN = TypeAdapter(Origin)
+
+
 def origin(run: Run) -> Origin:
-    """The origin of a run, as its file has it."""
+    """The origin of a run, as its file has it. RunError where that cannot be read."""
     for path in (run.path / FILE, run.path / EARLIER_FILE):
-        record = json.loads(path.read_bytes()) if path.exists() else {}
-        if "study" in record:
-            return Origin(**record | {"commits": tuple(record["commits"])})
+        try:
+            record = durable.parsed(path.read_bytes()) if path.exists() else {}
+            if not isinstance(record, dict):
+                raise TypeError(f"it must hold an object, found a {type(record).__name__}")
+            if "study" in record:
+                return _ORIGIN.validate_python(record)
+        except (OSError, ValueError, TypeError) as error:
+            reason = " ".join(str(error).split())
+            raise RunError(
+                f"run {run.name} is not whole: cannot read {path}: {reason}; restore it from a copy"
+            ) from None
     return Origin()
 
 
