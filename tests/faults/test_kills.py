@@ -16,17 +16,24 @@ from multiprocessing.process import BaseProcess
 from pathlib import Path
 from typing import Any
 
+import object_stores
 import pytest
 import synthetic
 import toil
+from run_digest import digests
 
 from t6gps.storage import catalog, tables
 from t6gps.storage.care.verify import verify
+from t6gps.storage.catalog import Run
+from t6gps.storage.objects import publishing
+from t6gps.storage.objects.place import ObjectPath
 from t6gps.storage.spool import Spool
 
 KILLS_N = int(os.environ.get("T6GPS_KILLS", "20"))
 LONGEST_S = 0.15
 """Between a sign of work and the kill: several episodes, a commit, or a copy."""
+PUBLISHING_SIGNS_N, KILLS_OF_A_RUN_N = 20, 5
+"""Files of an iteration, about; and how often a run is killed, which grows meanwhile, and then another is."""
 DEADLINE_S = 240.0
 
 
@@ -112,8 +119,33 @@ def started(forks: ForkServerContext) -> Iterator[Callable[..., tuple[BaseProces
 
 
 @pytest.mark.slow
+def test_a_run_whose_publishing_is_killed_is_sound_in_the_store_and_comes_whole(
+    tmp_path: Path, killed: Any, started: Any, objects: ObjectPath, seaweed: object_stores.Store
+) -> None:
+    stop, published_n = tmp_path / "stop", 0
+    _, looks = started(toil.read, str(objects), stop, seaweed.environment)
+    for kill in range(KILLS_N):
+        if kill % KILLS_OF_A_RUN_N == 0:
+            run, copied_n = synthetic.made(tmp_path, 0, f"run-{kill}"), 0
+            copied, copy = objects / run.name, Run(objects / run.name)
+        killed(toil.publish, PUBLISHING_SIGNS_N, run.path, str(objects), seaweed.environment)
+        assert verify(copy) == []
+        before_n, copied_n = copied_n, tables.committed_iterations(copy)
+        assert before_n <= copied_n <= tables.committed_iterations(run)
+        if (kill + 1) % KILLS_OF_A_RUN_N and kill + 1 < KILLS_N:
+            continue
+        stop.touch()  # a reader of one run looks often
+        published_n += copied_n
+        publishing.publish(run.path, copied, publishing.AT_WORK)
+        assert digests(copied) == digests(run.path)
+        assert all((copied / file).read_bytes() == (run.path / file).read_bytes() for file in copied.below())
+    assert published_n > KILLS_N / 4
+    assert looks.poll(DEADLINE_S) and looks.recv() > 0
+
+
+@pytest.mark.slow
 def test_four_who_write_runs_and_four_who_read_them_do_not_disturb_each_other(tmp_path: Path, started: Any) -> None:
-    readers = [started(toil.read, tmp_path) for _ in range(4)]
+    readers = [started(toil.read, str(tmp_path), tmp_path / "stop", {}) for _ in range(4)]
     writers = [started(toil.write, tmp_path, f"run-{number}") for number in range(4)]
     for process, said in writers:
         assert said.poll(DEADLINE_S) and said.recv() == "done"
