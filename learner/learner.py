@@ -175,9 +175,7 @@ class Learner:
             losses.append(loss)
         newest = replace(newest, version=iteration + 1)
         self._carried.advance(newest, pairs)
-        explores_within = self._settings.leads(iteration) and self._settings.action_value.reach_noise > 0
-        within_m = self._task.reach_m if explores_within else None
-        divergence = _divergence(newest, rows, seen, self._task.command_range_m, within_m)
+        divergence = _divergence(newest, rows, seen, self._task, self._settings.explores_within_reach(iteration))
         trained = Trained(supervised.Loss(losses[0].before, losses[-1].after), divergence)
         results = Iteration(segmented, fitted, improved, trained)
         self.done = Done(report=report(results, iteration, self._task.command_range_m, *self._task.cost_weights))
@@ -252,23 +250,17 @@ def _learned(improved: Improved, rows: Rows) -> Floats:
     return improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
 
 
-def _divergence(
-    snapshot: PolicySnapshot,
-    rows: Rows,
-    seen: Floats,
-    command_range_m: tuple[float, float],
-    within_m: float | None,
-) -> Floats:
+def _divergence(snapshot: PolicySnapshot, rows: Rows, seen: Floats, task: Task, within_reach: bool) -> Floats:
     """KL divergence of a policy from the one that acted [n] (nat), both with the noise of the row's episode.
 
-    within_m   how far winches come, where noise departed from what they reach of a command
+    within_reach   the noise departed from what the winches reach of a command
     """
     explored, divergence = exploration(rows, rows.acts), np.empty(len(rows.acts), dtype=np.float32)
     for part in row_pieces(np.arange(len(rows.acts))):
-        mean = np.clip(policy.act(snapshot, seen[part]), *command_range_m)
-        if within_m is not None:
-            rest_lengths = schema.rest_lengths(seen[part], snapshot.offset_m)
-            mean = np.clip(mean, rest_lengths - np.float32(within_m), rest_lengths + np.float32(within_m))
+        mean = np.clip(policy.act(snapshot, seen[part]), *task.command_range_m)
+        if within_reach:
+            rest_lengths, reach = schema.rest_lengths(seen[part], snapshot.offset_m), np.float32(task.reach_m)
+            mean = np.clip(mean, rest_lengths - reach, rest_lengths + reach)
         if rows.labels is not None:
             mean = standard_gps.to_world(mean, rows.labels[part])
         divergence[part] = kl(rows, part, mean, explored)

@@ -111,6 +111,10 @@ class LearnerSettings(Settings):
         """True where the action value improves the actions of an iteration."""
         return 0 < self.value_from <= iteration
 
+    def explores_within_reach(self, iteration: int) -> bool:
+        """True where noise departs from what the winches reach of a command in the episodes of an iteration."""
+        return self.leads(iteration) and self.action_value.reach_noise > 0
+
     @model_validator(mode="after")
     def _led_by_a_value(self) -> "LearnerSettings":
         if (self.models_share or self.rounds > 1) and not self.value_from:

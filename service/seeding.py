@@ -53,7 +53,7 @@ def training_plans(config: Config, iteration: int) -> list[EpisodePlan]:
             index=index,
             noise_std_m=_noise_std_m(config, iteration, index),
             version=max(iteration - staleness, 0),
-            within_reach=_within_reach(config, iteration),
+            within_reach=config.learner.explores_within_reach(iteration),
         )
         for index in range(size)
     ]
@@ -67,13 +67,9 @@ def _noise_std_m(config: Config, iteration: int, index: int) -> float:
     exploration = config.exploration
     quiet = int((index + 1) * exploration.quiet_share) > int(index * exploration.quiet_share)
     noise_std_m = exploration.noise_std_m
-    if _within_reach(config, iteration):
+    if config.learner.explores_within_reach(iteration):
         noise_std_m = config.learner.action_value.reach_noise * reach_m(config.robot)
     return noise_std_m * (QUIET if iteration and quiet else 1.0)
-
-
-def _within_reach(config: Config, iteration: int) -> bool:
-    return config.learner.action_value.reach_noise > 0 and config.learner.leads(iteration)
 
 
 def evaluation_plans(

@@ -28,14 +28,16 @@ from t6gps.storage import durable
 from t6gps.storage.errors import CheckpointError
 
 JSON: TypeAlias = "dict[str, JSON] | list[JSON] | str | int | float | bool | None"
-Arrays: TypeAlias = dict[str, NDArray[Any]]
+Array: TypeAlias = NDArray[Any]
+Arrays: TypeAlias = dict[str, Array]
+_Record: TypeAlias = dict[str, Any]
 
 KEPT_N = 3
 _NAME = re.compile(r"iteration-[0-9]{6}")
 _log = logging.getLogger(__name__)
 
 
-def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Mapping[str, NDArray[Any]]) -> Path:
+def save(folder: Path, iteration: int, manifest: Mapping[str, JSON], arrays: Mapping[str, Array]) -> Path:
     """Save the state after `iteration` under `folder`; once this returns it survives a crash.
 
     A checkpoint of the same iteration is replaced; those before the last three are removed. Raises
@@ -118,7 +120,7 @@ def _found(folder: Path) -> list[Path]:
     return sorted((path for path in folder.glob("iteration-*") if _NAME.fullmatch(path.name)), reverse=True)
 
 
-def packed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
+def packed(arrays: Mapping[str, Array]) -> bytes:
     """An .npz archive; numpy's own writer reserves some names of arrays for its arguments."""
     buffer = io.BytesIO()
     with zipfile.ZipFile(buffer, "w") as archive:
@@ -132,10 +134,10 @@ def _done(path: Path) -> str:
     return _bytes(path, "DONE").decode(errors="replace")
 
 
-def _record(path: Path, text: bytes) -> dict[str, Any]:
+def _record(path: Path, text: bytes) -> _Record:
     """What a manifest of that sum says: who altered both may have written anything."""
     try:
-        record: dict[str, Any] = durable.parsed(text)
+        record: _Record = durable.parsed(text)
         record["iteration"], record["manifest"].keys(), record["sha256"]["arrays.npz"]
     except (ValueError, TypeError, LookupError, AttributeError) as error:
         raise CheckpointError(f"checkpoint {path}: manifest.json is none: {error!r}") from None
