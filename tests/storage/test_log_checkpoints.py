@@ -104,6 +104,7 @@ DAMAGES: dict[str, tuple[Callable[[Run], object], str, bool]] = {
     **{
         f"a commit's {name}": (lambda run, change=change: alter(run, "frames", 4, change), CONTRADICTED, True)
         for name, change in ALTERED.items()
+        if name != "rows left out"  # that is said of the commit itself
     },
 }
 """What each does, what is said of the checkpoint, and whether the log is built anew: it is where commits are wrong."""

@@ -141,7 +141,9 @@ def test_a_world_that_the_file_does_not_fit_is_one_error(
 ) -> None:
     config = Config(**settings)  # type: ignore[arg-type]
     ground = Ground(file="ground/hills.npy", sha256="abc")
-    origin = Origin(schema_version=7, commit="", date="", versions={}, compiled={}, ground=ground)
+    origin = Origin(
+        schema_version=7, commit="", date="2026-11-28T00:00:00+00:00", versions={}, compiled={}, ground=ground
+    )
     found = description.describe("rolling", config, origin, material.snapshot)
     assert "/a/" not in found.to_json()
     with pytest.raises(ConfigError, match=words):
