@@ -175,7 +175,7 @@ class Learner:
             losses.append(loss)
         newest = replace(newest, version=iteration + 1)
         self._carried.advance(newest, pairs)
-        divergence = _divergence(newest, rows, seen, self._task, self._settings.explores_within_reach(iteration))
+        divergence = _divergence(newest, segmented, seen, self._task, self._settings.explores_within_reach(iteration))
         trained = Trained(supervised.Loss(losses[0].before, losses[-1].after), divergence)
         results = Iteration(segmented, fitted, improved, trained)
         self.done = Done(report=report(results, iteration, self._task.command_range_m, *self._task.cost_weights))
@@ -250,17 +250,19 @@ def _learned(improved: Improved, rows: Rows) -> Floats:
     return improved.action if rows.labels is None else standard_gps.to_canonical(improved.action, rows.labels)
 
 
-def _divergence(snapshot: PolicySnapshot, rows: Rows, seen: Floats, task: Task, within_reach: bool) -> Floats:
+def _divergence(snapshot: PolicySnapshot, segmented: Segmented, seen: Floats, task: Task, within_reach: bool) -> Floats:
     """KL divergence of a policy from the one that acted [n] (nat), both with the noise of the row's episode.
+
+    Of the rows of the iteration at work; those of earlier ones have NaN.
 
     within_reach   the noise departed from what the winches reach of a command
     """
-    explored, divergence = exploration(rows, rows.acts), np.empty(len(rows.acts), dtype=np.float32)
-    for part in row_pieces(np.arange(len(rows.acts))):
+    rows = segmented.rows
+    explored, divergence = exploration(rows, rows.acts), np.full(len(rows.acts), np.nan, dtype=np.float32)
+    for part in row_pieces(np.flatnonzero(segmented.newest)):
         mean = np.clip(policy.act(snapshot, seen[part]), *task.command_range_m)
         if within_reach:
-            rest_lengths, reach = schema.rest_lengths(seen[part], snapshot.offset_m), np.float32(task.reach_m)
-            mean = np.clip(mean, rest_lengths - reach, rest_lengths + reach)
+            mean = schema.reached(mean, seen[part], snapshot.offset_m, task.reach_m)
         if rows.labels is not None:
             mean = standard_gps.to_world(mean, rows.labels[part])
         divergence[part] = kl(rows, part, mean, explored)

@@ -8,11 +8,15 @@ stays the same while the support triangle stays the same. Columns without the wo
 
 from __future__ import annotations
 
+from typing import TypeVar
+
 import numpy as np
 import pyarrow as pa
 from numpy.typing import NDArray
 
 from t6gps.storage.fields import numbers, scalar, vector, vector_length
+
+Number = TypeVar("Number", np.float32, np.float64)
 
 SCHEMA_VERSION = 7
 """Grows with every change. Versions 2, 3, 5 and 6 added columns at the end of `iterations`, version 2 of `classes`,
@@ -29,9 +33,15 @@ REST_LENGTH_SCALE_M, NODE_SCALE_M = 0.2, 0.5
 """Their units."""
 
 
-def rest_lengths(observation: NDArray[np.float32], nominal_m: float) -> NDArray[np.float32]:
-    """Rest lengths [..., 24] (m) in observations [..., 83], which have them about the nominal one."""
-    return observation[..., REST_LENGTHS] * np.float32(REST_LENGTH_SCALE_M) + np.float32(nominal_m)
+def reached(
+    command: NDArray[Number], observation: NDArray[np.float32], nominal_m: float, reach_m: float
+) -> NDArray[Number]:
+    """What winches come to of canonical commands [..., 24] (m), if each comes `reach_m` from its rest length at most.
+
+    These are in observations [..., 83], about the nominal one.
+    """
+    rest_lengths = observation[..., REST_LENGTHS] * np.float32(REST_LENGTH_SCALE_M) + np.float32(nominal_m)
+    return np.clip(command, rest_lengths - np.float32(reach_m), rest_lengths + np.float32(reach_m))
 
 
 def _schema(*fields: pa.Field) -> pa.Schema:

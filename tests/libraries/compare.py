@@ -7,14 +7,13 @@ speed of each contender over that loop's of the same round, medians over rounds.
 from __future__ import annotations
 
 import argparse
-import json
 import sys
-from dataclasses import asdict
 
 from library_contenders import async_vector_env, rllib
 
 from t6gps.service.bench import pool, rounds
 from t6gps.service.bench.contenders import raw, rough_job, service
+from t6gps.service.bench.registry import Measurement
 from t6gps.service.bench.rounds import Contender, Say
 from t6gps.service.provenance import provenance
 
@@ -42,9 +41,8 @@ def main() -> None:
     parser.add_argument("--seconds", type=float, default=pool.SECONDS, help="of each turn")
     parser.add_argument("--rounds", type=int, default=pool.ROUNDS, help="turns of each contender")
     chosen = parser.parse_args()
-    origin = asdict(provenance())
-    results = measure(chosen.seconds, chosen.rounds, lambda line: print(line, file=sys.stderr))
-    print(json.dumps({"bench": "libraries", **origin, "results": results}))
+    figures = measure(chosen.seconds, chosen.rounds, lambda line: print(line, file=sys.stderr))
+    print(Measurement("libraries", provenance(), 1, (), dict(figures)).to_json())
 
 
 if __name__ == "__main__":

@@ -14,7 +14,6 @@ how many times as long the server takes; medians over rounds. Run it on a machin
 from __future__ import annotations
 
 import argparse
-import json
 import multiprocessing
 import os
 import re
@@ -24,7 +23,6 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import contextmanager
-from dataclasses import asdict
 from multiprocessing.connection import Connection
 from pathlib import Path
 
@@ -33,6 +31,7 @@ import pyarrow as pa
 from pyarrow import flight
 
 import t6gps
+from t6gps.service.bench.registry import Measurement
 from t6gps.service.bench.rounds import Say
 from t6gps.service.bench.stores import material
 from t6gps.service.bench.stores.contestants import T6Gps
@@ -157,9 +156,8 @@ def main() -> None:
     parser.add_argument("--megabytes", type=float, default=79.0, help="of the table")
     parser.add_argument("--rounds", type=int, default=9, help="turns of each contender")
     chosen = parser.parse_args()
-    origin = asdict(provenance())
-    results = measure(chosen.megabytes, chosen.rounds, lambda line: print(line, file=sys.stderr))
-    print(json.dumps({"bench": "flight", **origin, "results": results}))
+    figures = measure(chosen.megabytes, chosen.rounds, lambda line: print(line, file=sys.stderr))
+    print(Measurement("flight", provenance(), 1, (), dict(figures)).to_json())
 
 
 if __name__ == "__main__":

@@ -73,8 +73,7 @@ def controlled(
     for step, departure in enumerate(noise):
         wanted = control(episode, step)
         if plan.within_reach:
-            rest_lengths = schema.rest_lengths(episode.observation, nominal_m)
-            wanted = np.clip(wanted, rest_lengths - reach, rest_lengths + reach)
+            wanted = schema.reached(wanted, episode.observation, nominal_m, reach)
         mean, command, action = steer(wanted, departure, episode.frame.element, shortest_m, longest_m)
         try:
             episode.advance(command)
